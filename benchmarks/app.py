@@ -248,11 +248,13 @@ def report(
         Path | None, output_option("INDEX.md", "Index to write; the pages go to a folder beside it. Default: print.")
     ] = None,
 ) -> None:
-    """Convert result files to Markdown: an index, and one page for each system."""
-    from benchmarks import pages
+    """Convert result files to Markdown: all rows, printed; or, with an output, an index and a page for each system."""
+    from benchmarks import pages, read_runs, tables
 
     if output is None:
-        show_text("\n".join(pages(files).values()))
+        for path in files:
+            for run in read_runs(path):
+                show_text(f"## `{path.name}`: `{run.environment['command']}`\n\n{tables(run.rows)}")
         return
     check_output(output, ".md")
     from wlm.formats.atomic import atomic_write

@@ -103,6 +103,8 @@ def test_pages_of_results_are_those_that_the_command_makes(monkeypatch):
         ["benchmarks/nvidia-h200.json", "benchmarks/nvidia-h100.json", "benchmarks/cpu.json"], "docs/results.md"
     ).items():
         assert (DOCS / name).read_text(encoding="utf-8") == page, name
+        rows = re.findall(r"^\| (?!---|method).*$", page, re.M)
+        assert len(rows) <= 60 and max(map(len, (row.split("|") for row in rows)), default=0) <= 12, name
 
 
 def test_every_picture_is_shown_and_small():

@@ -5,18 +5,19 @@ order of completion, and if workers are lost.
 """
 
 import math
+import pickle
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from wlm import interop
-from wlm.errors import WlmError
+from wlm.errors import WlmError, one_line
 from wlm.formats.checkpoint import Checkpoint
-from wlm.metrics import nanmean
+from wlm.formats.parts import Part
 from wlm.system import Meter
 from wlm.workers import Actors, Here, Lost, Processes, Workers
 
@@ -31,38 +32,35 @@ _STOPPING = 30.0  # seconds that workers get to return their state before a stop
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """An independent part of long work.
+    """An independent part of long work, of so many `steps` in the unit of the progress.
 
-    Attributes:
-        numbers: Numbers of the batches in it, which a checkpoint keeps separately; the first is the task's own.
-        steps: Its share of the work, in the unit of the progress.
-        job: Returns what a worker needs to begin; called then.
-        kind: Tasks of one kind use the same kernels: the first runs alone until these are compiled. None: no such kind.
+    Its `numbers` are those of the batches in it in a checkpoint; the first is the task's own. `job` returns what a
+    worker needs to begin, and is called then. Of the tasks of a `kind`, other than None, the first runs alone until
+    their kernels are compiled. `table` has types and shapes of the arrays of a result that `gathered` keeps.
     """
 
     numbers: tuple[int, ...]
     steps: int
     job: Callable[[], Any]
     kind: Any = None
+    table: Mapping[str, Part] | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class Advance:
-    """The progress of a task: steps done, measured values as for `wlm.system.Meter.report`, and the result once the
-    task is `finished`."""
+class Advance(NamedTuple):
+    """The progress of a task: steps done, measured values as for `Meter.report`, and the result once it is finished."""
 
     step: int
-    figures: Mapping[str, float] = field(default_factory=dict)
+    figures: Mapping[str, float] = {}
     finished: bool = False
     result: Any = None
 
 
 class Whole:
-    """Base of workers whose tasks are a single call of `run`, without a state to save.
+    """Base of workers whose tasks are a single call of `run`, without a state to save. A long call may report the
+    finished share of the task by `report`, which has no effect in other processes.
 
-    Within a long call, `run` may report the finished share of the task by `report`, which has no effect in other
-    processes. Workers whose tasks can be interrupted have these methods themselves, and a method `state`, which returns
-    a list with the arrays of each batch by name.
+    Workers whose tasks have a state have these methods themselves, but for `run`, and a method `state`, which returns a
+    list with the arrays of each batch by name.
     """
 
     report: Callable[[float], None] = staticmethod(lambda share: None)
@@ -84,51 +82,98 @@ class Whole:
         """Frees memory and ends threads."""
 
 
-def worker_devices(device: str, workers: int | None, cluster: str | None, usual: int = 1) -> list[str]:
-    """Returns the device of each worker, or that of all on a cluster; `usual` is the number on a CPU by default.
+class Place(NamedTuple):
+    """Where tasks run.
 
-    Args:
+    Attributes:
         device: "cpu", "cuda" or "cuda:N". Several workers on "cuda" are spread over the GPUs of this machine.
-        workers: Number of workers, None for the default: on a GPU one, on a cluster as many as it has room for.
-        cluster: Address of a Ray cluster; None: this machine.
-
-    Raises:
-        WlmError: There are no workers, or no such device.
+        workers: Number of workers; None: one, on a cluster as many as have room.
+        cluster: Address of a Ray cluster, whose workers take two CPUs or a GPU each; None: processes of this machine.
     """
-    if workers is not None and workers < 1:
-        raise WlmError(f"workers: expected at least 1, got {workers}")
-    if cluster is not None:
-        if device not in ("cpu", "cuda"):
-            raise WlmError(f"device '{device}': expected cpu or cuda when the work runs on a cluster")
-        return [device]
-    checked = interop.check_device(device)
-    if device == "cpu":
-        return ["cpu"] * (workers or usual)
-    gpus = interop.available_devices()[1:] if device == "cuda" else [checked]
-    return [gpus[i % len(gpus)] for i in range(workers or 1)]
+
+    device: str = "cpu"
+    workers: int | None = None
+    cluster: str | None = None
+
+    def devices(self) -> list[str]:
+        """Returns the device of each worker, or that of all on a cluster; there must be one at least."""
+        from wlm import interop  # torch and Warp take seconds to import, which small workers need not spend
+
+        if self.workers is not None and self.workers < 1:
+            raise WlmError(f"workers: expected at least 1, got {self.workers}")
+        if self.cluster is not None:
+            if self.device not in ("cpu", "cuda"):
+                raise WlmError(f"device '{self.device}': expected cpu or cuda when the work runs on a cluster")
+            return [self.device]
+        each = [interop.check_device(self.device)]
+        if self.device == "cuda":
+            each = interop.available_devices()[1:]
+        return [each[i % len(each)] for i in range(self.workers or 1)]
+
+    @property
+    def here(self) -> str:
+        """The device for work beside the tasks; that of a cluster is not on this machine."""
+        device = self.devices()[0]
+        return "cpu" if self.cluster is not None else device
 
 
-def start_workers(
-    make: type,
-    arguments: tuple[Any, ...],
-    device: str,
-    workers: int | None,
-    cluster: str | None,
-    tasks: int,
-    usual: int = 1,
-) -> Workers:
-    """Starts workers of a class, at most one for each of so many tasks.
+def start_workers(worker: tuple, place: Place, tasks: int) -> Workers:
+    """Starts workers, at most one for each of so many tasks; a single one on this machine is in this process.
 
-    `make`, from a module that can be imported, is called with a device and the `arguments`; the other arguments are
-    those of `worker_devices`. One worker on this machine is in this process.
-    """
-    devices = worker_devices(device, workers, cluster, usual)[: max(tasks, 1)]
-    if cluster is not None:
-        share = {"CPU": float(CPU_LANES)} if device == "cpu" else {"GPU": 1.0}
-        return Actors(make, (device, *arguments), workers, max(tasks, 1), cluster, share)
+    `worker` is a class, from a module that can be imported, and its arguments after the first, a device."""
+    make, *arguments = worker
+    devices = place.devices()[:tasks]
+    if place.cluster is not None:
+        share = {"CPU": float(CPU_LANES)} if place.device == "cpu" else {"GPU": 1.0}
+        return Actors(make, (place.device, *arguments), place.workers, tasks, place.cluster, share)
     if len(devices) == 1:
         return Here(make(devices[0], *arguments))
     return Processes(make, [(each, *arguments) for each in devices])
+
+
+def run(
+    worker: tuple, tasks: list[Task], meter: Meter, place: Place, checkpoint: Checkpoint | None = None, done: int = 0
+) -> Iterator[tuple[Task, Any]]:
+    """Runs tasks by workers, see `start_workers`, of a class that has the methods of `Whole`.
+
+    Tasks begin in their order. Those of lost workers begin again, and `meter` reports the progress, with `done` steps
+    before. The checkpoint has the states of running tasks; the caller adds results, which are written when the work
+    is stopped.
+
+    Yields:
+        Each finished task with its result.
+
+    Raises:
+        WlmError: A task failed, a saved state is wrong, or the workers of a task died again and again.
+        KeyboardInterrupt: Raised by the progress callback; the states of running tasks have been saved.
+    """
+    if tasks:
+        try:
+            with closing(start_workers(worker, place, len(tasks))) as pool:
+                states = checkpoint if hasattr(worker[0], "state") else None
+                yield from _Dispatch(pool, tasks, meter, done, states).run()
+        except (WlmError, KeyboardInterrupt):
+            if checkpoint is not None:
+                checkpoint.flush()
+            raise
+
+
+def gathered(
+    worker: tuple, tasks: list[Task], meter: Meter, place: Place, checkpoint: Checkpoint | None = None, done: int = 0
+) -> dict[int, Any]:
+    """Returns the result of each task by its number: from the checkpoint if it has it, or else by `run`."""
+    results, left = {}, []
+    for task in tasks:
+        kept = None if checkpoint is None else checkpoint.finished(task.numbers[0], task.table)
+        if kept is None:
+            left.append(task)
+        else:
+            results[task.numbers[0]], done = kept, done + task.steps
+    for task, result in run(worker, left, meter, place, checkpoint, done):
+        results[task.numbers[0]] = result
+        if checkpoint is not None:
+            checkpoint.add_finished(task.numbers[0], result)
+    return results
 
 
 @dataclass(eq=False)
@@ -139,47 +184,25 @@ class _Running:
     saving: bool = False
 
 
-class Dispatch:
+class _Dispatch:
     """Hands out tasks, restarts those of lost workers, reports progress and saves the states of running tasks."""
 
     def __init__(
-        self,
-        workers: Workers,
-        tasks: Sequence[Task],
-        meter: Meter,
-        done: int = 0,
-        checkpoint: Checkpoint | None = None,
+        self, workers: Workers, tasks: list[Task], meter: Meter, done: int, checkpoint: Checkpoint | None
     ) -> None:
-        """Prepares the tasks; nothing starts before `run`.
-
-        Args:
-            workers: From `start_workers`, of a class with the methods of `Whole`.
-            tasks: The tasks, which begin in this order.
-            meter: Reports the progress.
-            done: Steps that are finished already.
-            checkpoint: Keeps the states of running tasks, and has those of an earlier run; None: they have none.
-        """
         self._workers, self._meter, self._done, self._checkpoint = workers, meter, done, checkpoint
         self._waiting = deque(tasks)
         self._running: dict[int, _Running] = {}
         self._dead: set[int] = set()
         self._compiled: set[Any] = {None}
-        self._figures: dict[int, Mapping[str, float]] = {}
+        self._figures: Mapping[str, float] = {}  # of the task that advanced last
         self._states: dict[int, dict[str, np.ndarray]] | None = None  # the states of a save that is under way
         self._stop: KeyboardInterrupt | None = None
         self._patience = math.inf
-        workers.on_share(self._share)
+        if isinstance(workers, Here):
+            workers.worker.report = self._share
 
-    def run(self) -> Iterator[tuple[int, Any]]:
-        """Runs the tasks.
-
-        Yields:
-            The number and the result of each finished task. The caller adds results to the checkpoint.
-
-        Raises:
-            WlmError: A task failed, a saved state is wrong, or the workers of a task died again and again.
-            KeyboardInterrupt: Raised by the progress callback; the states of running tasks have been saved.
-        """
+    def run(self) -> Iterator[tuple[Task, Any]]:
         free = list(range(self._workers.count))[::-1]
         while self._waiting or self._running:
             while self._waiting and free and self._may_begin(self._waiting[0].kind):
@@ -208,7 +231,11 @@ class Dispatch:
         self._running[number] = run
         kept = self._checkpoint
         states = [None if kept is None else kept.running(each) for each in run.task.numbers]
-        self._workers.call(number, "start", run.task.job(), states)
+        try:
+            self._workers.call(number, "start", run.task.job(), states)
+        except (TypeError, AttributeError, pickle.PicklingError) as error:
+            told = f"{self._meter.stage}: task {run.task.numbers[0]} cannot be sent to a worker: {one_line(error)}"
+            raise WlmError(told) from error
 
     def _restart(self, number: int, why: Lost) -> None:
         self._dead.add(number)
@@ -220,7 +247,7 @@ class Dispatch:
             raise WlmError(f"{self._meter.stage}: {_DEATHS} workers died of task {run.task.numbers[0]}: {why}")
         self._begin(number, run)
 
-    def _take(self, number: int, answer: Any) -> tuple[int, Any] | None:
+    def _take(self, number: int, answer: Any) -> tuple[Task, Any] | None:
         """Handles a worker's answer and gives the worker more work. Returns the task and its result if it is done."""
         run = self._running[number]
         if isinstance(answer, BaseException):
@@ -237,10 +264,10 @@ class Dispatch:
                     self._states.pop(each, None)
             if not begun:
                 self._compiled.add(run.task.kind)
-                self._figures[number] = answer.figures
+                self._figures = answer.figures
                 self._report(moved=True)
             if answer.finished:
-                return run.task.numbers[0], answer.result
+                return run.task, answer.result
         else:
             self._states |= zip(run.task.numbers, answer, strict=True)
             run.saving, run.deaths = False, 0
@@ -263,10 +290,8 @@ class Dispatch:
             return
         done = self._done + sum(run.step or 0 for run in self._running.values())
         if self._meter.due(done):
-            names = dict.fromkeys(name for each in self._figures.values() for name in each)
-            known = ((name, [each[name] for each in self._figures.values() if name in each]) for name in names)
             try:
-                self._meter.report(done, **{name: float(nanmean(np.array(values))) for name, values in known})
+                self._meter.report(done, **self._figures)
             except KeyboardInterrupt as stop:
                 # Between two steps the states are complete; an interrupt anywhere else saves nothing.
                 self._stop, self._patience = stop, time.monotonic() + _STOPPING

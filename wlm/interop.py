@@ -3,6 +3,7 @@
 import gc
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import fields, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -48,6 +49,12 @@ def check_device(name: str) -> str:
 def device_name(device: torch.device) -> str:
     """Returns the name of a tensor's device, "cpu" or "cuda:N", which Warp accepts too."""
     return "cpu" if device.type == "cpu" else f"cuda:{device.index or 0}"
+
+
+def moved(value: Any, device: str | torch.device) -> Any:
+    """Returns a copy of a dataclass with its tensors on a device."""
+    parts = ((each.name, getattr(value, each.name)) for each in fields(value))
+    return replace(value, **{name: part.to(device) for name, part in parts if isinstance(part, torch.Tensor)})
 
 
 def free_memory(device: wp.Device) -> int:

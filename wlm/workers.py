@@ -80,9 +80,6 @@ class Workers(ABC):
         no longer exists.
         """
 
-    def on_share(self, report: Callable[[float], None]) -> None:  # noqa: B027  (only a worker of this process can)
-        """Sets what the worker calls with the finished share of a long call, if it is in this process."""
-
     @abstractmethod
     def renew(self, number: int) -> None:
         """Creates a lost worker again."""
@@ -93,14 +90,14 @@ class Workers(ABC):
 
 
 class Here(Workers):
-    """A single worker in this process; it executes its call in `wait`."""
+    """A single `worker` in this process; it executes its call in `wait`."""
 
     count = 1
     remote = False
 
     def __init__(self, worker: Any) -> None:
         """Wraps a worker object, which must have a method `close`."""
-        self._worker, self._call = worker, ("", ())
+        self.worker, self._call = worker, ("", ())
 
     def call(self, number: int, method: str, *arguments: Any) -> None:
         self._call = method, arguments
@@ -108,18 +105,15 @@ class Here(Workers):
     def wait(self, seconds: float) -> tuple[int, Any]:
         (method, arguments), self._call = self._call, ("", ())
         try:
-            return 0, getattr(self._worker, method)(*arguments)
+            return 0, getattr(self.worker, method)(*arguments)
         except Exception as error:
             return 0, error
-
-    def on_share(self, report: Callable[[float], None]) -> None:
-        self._worker.report = report
 
     def renew(self, number: int) -> None:
         raise AssertionError("this process is not lost")
 
     def close(self) -> None:
-        self._worker.close()
+        self.worker.close()
 
 
 class Processes(Workers):
@@ -161,10 +155,6 @@ class Processes(Workers):
     def renew(self, number: int) -> None:
         self._end(number)
         self._start(number)
-
-    def kill(self, number: int) -> None:
-        """Ends a worker at once, whatever it does; `wait` then returns it as lost."""
-        self._processes[number].kill()
 
     def close(self) -> None:
         for process in self._processes.values():
@@ -217,15 +207,7 @@ class Processes(Workers):
 class Actors(Workers):
     """Workers on a Ray cluster, each with its own resources."""
 
-    def __init__(
-        self,
-        make: type,
-        arguments: tuple[Any, ...],
-        count: int | None,
-        most: int,
-        address: str,
-        share: dict[str, float],
-    ) -> None:
+    def __init__(self, make: type, arguments: tuple, count: int | None, most: int, address: str, share: dict) -> None:
         """Connects to the cluster at an address, as for `ray.init`, and requests the workers; they start when resources
         become free.
 

@@ -11,9 +11,12 @@ import numpy as np
 import pytest
 from builders.bake_rooms import ROOM, quad
 from builders.gltf_scene import Thing, write_scene
+from builders.running import report_always
+from builders.worker_pools import ToyBaker
 from PIL import Image
 from typer.testing import CliRunner
 
+from wlm.bake import work
 from wlm.bake.daylight import sun_direction
 from wlm.bake.geometry import Geometry, read_geometry
 from wlm.bake.lightmaps import BakedLightmaps, write_lightmaps
@@ -22,9 +25,9 @@ from wlm.bake.settings import Lamp, LightmapSettings, ProbeSettings
 from wlm.bake.texels import place_texels
 from wlm.bake.work import each_hour, open_checkpoint, open_task
 from wlm.cli import app
+from wlm.dispatch import Place
 from wlm.errors import WlmError
 from wlm.formats.gltf import read_gltf, vertex_normals
-from wlm.formats.parts import Part
 from wlm.inspection import inspect
 from wlm.lightmap import load
 from wlm.probe.data import load as load_probes
@@ -161,23 +164,31 @@ def test_probes_are_in_a_lattice():
         place_probes(ProbeSettings(spacing=0.001), geometry)
 
 
-def test_finished_hours_are_kept(tmp_path):
+def test_finished_hours_are_kept(tmp_path, monkeypatch):
+    monkeypatch.setattr(work, "HourBaker", ToyBaker)
+    report_always(monkeypatch)
     shutil.copytree(ROOM, tmp_path / "room")
     task = open_task(tmp_path / "room" / "room.yaml")
-    table, made = {"light": Part(np.float32, (1,))}, []
+    geometry, output, reports = read_geometry(task.geometry, None), tmp_path / "set", []
 
-    def make(hour, report):
-        if len(made) == 2:
+    def stop(progress):
+        reports.append(progress.done)
+        if progress.done > 200:
             raise KeyboardInterrupt
-        made.append(hour)
-        return {"light": np.full(1, hour, np.float32)}
 
-    output = tmp_path / "set"
+    def bake(progress=None, workers=None, device="cpu", **options):
+        checkpoint = open_checkpoint(output, task, "lightmaps", "cpu", **options)
+        place = Place(device, workers)
+        return each_hour(task, geometry, "irradiance", np.zeros(2), (2, 3), place, checkpoint, progress)
+
     with pytest.raises(KeyboardInterrupt):
-        each_hour([6, 12, 18], open_checkpoint(output, task, "lightmaps", "cpu"), table, make, None)
-    made.clear()
-    results = each_hour([6, 12, 18], open_checkpoint(output, task, "lightmaps", "cpu", resume=True), table, make, None)
-    assert made == [18] and [float(each["light"][0]) for each in results] == [6, 12, 18]
+        bake(stop)
+    assert reports == [50, 100, 100, 150, 200, 200, 250]
+    reports.clear()
+    results = bake(lambda progress: reports.append(progress.done), resume=True)
+    assert reports[0] == 250 and [float(each["mean"][1, 2]) for each in results] == sorted(task.scene.hours)
+    with pytest.raises(WlmError, match="workers: expected 1 on a GPU of this machine"):
+        bake(workers=2, device="cuda")
     changed = replace(task, scene=task.scene.model_copy(update={"samples": 8}))
     said = "set.partial: the checkpoint is of another fit: it was made with scene samples=256, not 8"
     with pytest.raises(WlmError, match=said):

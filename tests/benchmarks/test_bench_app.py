@@ -30,9 +30,6 @@ COMMANDS = [
         "lightmap-run-time --set city --quick --device cpu",
         {"walked_path": Path("a/city"), "quick": True},
     ),
-    (["shader-speed", "--quick"], "shader-speed --quick --device cpu", {"quick": True}),
-    (["scene", "--quick"], "scene --quick --device cpu", {"quick": True}),
-    (["lightmap-file", "--quick"], "lightmap-file --quick --device cpu", {"quick": True}),
     (
         ["probe", "--probes", "a/room.npz", "--key", "sh", "--key", "sh_noon"],
         "probe --device cpu --probes room.npz --key sh --key sh_noon",
@@ -65,14 +62,11 @@ COMMANDS = [
         "atlas-ablation --quick --profile cascade --device cpu --steps 9 --only ASTC",
         {"profile": "cascade", "only": ["ASTC"], "steps": 9},
     ),
-    (["smoke", "--quick"], "smoke --quick --device cpu", {"quick": True}),
     (
         ["kernels", "--quick", "--only", "atlas, read"],
         "kernels --quick --device cpu --only 'atlas, read'",
         {"quick": True},
     ),
-    (["growth", "--quick"], "growth --quick --device cpu", {"quick": True}),
-    (["fluid-gradients", "--quick"], "fluid-gradients --quick --device cpu", {"quick": True}),
     (["smoke-orders"], "smoke-orders --device cpu", {"quick": False}),
     (
         ["smoke-network", "--network", "a/young.safetensors", "--profile", "paper"],
@@ -80,6 +74,10 @@ COMMANDS = [
         {"networks": [Path("a/young.safetensors")], "profiles": ["paper"]},
     ),
     (["ops", "--only", "plane"], "ops --device cpu --only plane", {"only": ["plane"]}),
+    *(
+        ([name, "--quick"], f"{name} --quick --device cpu", {"quick": True})
+        for name in ("shader-speed", "scene", "lightmap-file", "smoke", "growth", "fluid-gradients")
+    ),
 ]
 
 
@@ -135,7 +133,7 @@ def test_errors_are_one_line(words, line):
 
 def test_report_makes_pages(tmp_path):
     file, index = tmp_path / "here.json", tmp_path / "index.md"
-    row = Row("lightmap", "city", "ours", "M", {"psnr": 45.98})
+    row = Row("lightmap", "city", "ours", "M", {"bytes": 1.0, "psnr": 45.98})
     write_json(file, [row], describe_environment("cpu", "python -m benchmarks"))
     text = call("report", file)
     assert "`here.json`" in text and "| 45.98 |" in text

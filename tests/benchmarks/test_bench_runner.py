@@ -146,16 +146,23 @@ def test_a_wide_table_is_parted_and_has_footnotes():
 
 
 def test_pages_by_system(tmp_path, monkeypatch):
+    """A page has the row of a method and option that has most figures, and the command that measured it."""
     monkeypatch.chdir(tmp_path)
     write_json("a.json", [OURS], ENVIRONMENT)
-    write_json("a.json", [Row("smoke-network", "s", "frame", "x", {"time_ms": 1.0})], ENVIRONMENT)
-    write_json("b.json", [OURS], ENVIRONMENT | {"device_name": "", "cuda": "13.0"})
+    frame = Row("smoke-network", "unseen smoke", "time against error", "coarse, h 2", {"psnr": 50.0, "time_ms": 1.0})
+    write_json("a.json", [frame, replace(frame, scene="another")], ENVIRONMENT)
+    write_json("b.json", [OURS.with_figures(seen=40.0)], ENVIRONMENT | {"device_name": ""})
     made = pages(["a.json", "b.json"], "docs/all.md")
     assert list(made) == ["all.md", "all/lightmap.md", "all/smoke.md"]
     head = "Made by `python -m benchmarks report a.json b.json -o docs/all.md`; changes by hand are lost."
     assert all(head in page for page in made.values())
-    assert "- [lightmap](all/lightmap.md): a CPU, cpu" in made["all.md"]
-    assert "## a CPU: `a.json`" in made["all/lightmap.md"] and "## cpu: `b.json`" in made["all/lightmap.md"]
-    heading = "### smoke-network, 2026-01-02\n\n`python -m benchmarks --json a.json`; 1 threads, Python 3"
-    assert heading in made["all/smoke.md"]
-    assert "torch 2, CUDA 13.0.\n\n#### city\n" in made["all/lightmap.md"]
+    assert "- [lightmap](all/lightmap.md)" in made["all.md"]
+    lightmap = made["all/lightmap.md"]
+    assert "| ours | M | b | 1,234,567 | 0.676 | 42.50 | 40.00 |" in lightmap and "| ours | M | a |" not in lightmap
+    assert "- `python -m benchmarks --json b.json`: cpu, 1 threads, Python 3, Warp 1, torch 2, 2026-01-02" in lightmap
+    assert (
+        "| time against error | coarse, h 2 | a | 50.00 | 1 |" in made["all/smoke.md"]
+        and "another" not in made["all/smoke.md"]
+    )
+    write_json("c.json", [replace(OURS, option=str(i)) for i in range(90)], ENVIRONMENT)
+    assert pages(["c.json"])["results/lightmap.md"].count("\n| ours") == 60

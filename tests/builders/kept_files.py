@@ -51,8 +51,7 @@ def _written(write: Callable[[Path], Any]) -> bytes:
 
 
 def _lightmap() -> Kept:
-    ranges = {"0.kind": (2, 7), "times": (3, 24.5), "0.constant": (0, -1.0), "0.scale_static": (0, -0.5)}
-    ranges |= {"0.affine": (0, -1.0)}
+    ranges = {"0.kind": (2, 7), "times": (3, 24.5), "0.constant": (0, -1.0), "0.affine": (0, -1.0)}
     return Kept(_written(synthetic.random_model(uvt_slices=1).save), wlm.load, {}, ranges)
 
 
@@ -63,12 +62,12 @@ def _frames() -> Kept:
 
 def _layers() -> Kept:
     ranges = {"0.kind": (0, 7), "times": (3, 24.5), "2.constant": (0, -1.0), "1.ranges": ((0, 0, 0), 3.0)}
-    return Kept(_written(random_layers(uvt_slices=1).save), wlm.load, {"0.mask": "missing"}, ranges)
+    return Kept(_written(random_layers(uvt_slices=1).save), wlm.load, {"0.mask": "missing size"}, ranges)
 
 
 def _groups() -> Kept:
     ranges = {"0.kind": (0, 7), "1.times": (0, 24.5), "0.constant": (0, -1.0), "1.ranges": ((0, 0, 0), 3.0)}
-    return Kept(_written(few_texels().save), wlm.load, {"0.mask": "missing"}, ranges)
+    return Kept(_written(few_texels().save), wlm.load, {"0.mask": "missing size"}, ranges)
 
 
 def _atlas(kind: str, colour: str) -> Kept:
@@ -94,7 +93,7 @@ def lightmap_fit() -> tuple[Any, Any]:
     """A fit of one dynamic tile, and a trainer of it after three steps."""
     fit = SheetFit(moving_light(40, 24).light, tiny_profile())
     (batch,) = fit.batches(0)
-    trainer = lightmap_trainer.Trainer(fit.model.profile, fit.model.axis, fit.job(batch).targets(), True, 0, "cpu")
+    trainer = lightmap_trainer.Trainer(fit.model.profile, fit.model.axis, fit.job(batch).targets(), 0, "cpu")
     trainer.run(3)
     return fit, trainer
 
@@ -143,18 +142,19 @@ def _probe_running() -> Kept:
 def _training() -> Kept:
     settings = TrainSettings(rounds=1, steps=4, batch=2, warmup=2, average=0.5)
     profile = Profile(name="tiny", network=NetworkSettings(width=8, levels=2), training=settings)
-    pools = {"make_pool": lambda *a, **k: _samples(), "make_validation": lambda *a, **k: _samples()}
+    made = dict.fromkeys(("make_pool", "make_validation"), lambda *a, **k: _samples())
+    pools = functools.partial(mock.patch.multiple, "wlm.smoke.network.dataset", **made)
 
     def write(path: Path) -> None:
         # Out of time after the first two steps.
-        with mock.patch("wlm.smoke.fit._CHUNK", 2):
-            train(profile, path, minutes=0.0, **pools)
+        with mock.patch("wlm.smoke.fit._CHUNK", 2), pools():
+            train(profile, path, minutes=0.0)
         for other in (path, Path(f"{path}.csv")):
             other.unlink(missing_ok=True)
 
     def read(path: Path) -> Any:
-        with mock.patch("wlm.smoke.fit._CHUNK", 2):
-            return train(profile, str(path).removesuffix(".partial"), resume=True, minutes=0.0, **pools)
+        with mock.patch("wlm.smoke.fit._CHUNK", 2), pools():
+            return train(profile, str(path).removesuffix(".partial"), resume=True, minutes=0.0)
 
     free = {"clock": "nan", "curve": "nan size"}
     ranges = {"step": ((), -1), "skipped": ((), 99.0), "counts": (0, -1), "adam.step.heads.0.bias": ((), -1.0)}

@@ -1,7 +1,14 @@
-"""Workers that answer in any order and get lost, in place of those of other processes."""
+"""Workers that answer in any order and get lost, in place of those of other processes; and small classes of workers."""
 
+import os
 import random
+import signal
+import time
 
+import numpy as np
+
+from wlm.dispatch import Whole
+from wlm.errors import WlmError
 from wlm.workers import Here, Lost, Workers
 
 
@@ -13,8 +20,8 @@ class Several(Workers):
 
     remote = False
 
-    def __init__(self, make, arguments, device, workers, cluster, tasks, usual=1, *, order=0, lose=()):
-        self.count, self._make = min(workers or 1, tasks), lambda: Here(make(device, *arguments))
+    def __init__(self, worker, place, tasks, *, order=0, lose=()):
+        self.count, self._make = min(place.workers or 1, tasks), lambda: Here(worker[0](place.device, *worker[1:]))
         self._random, self._lose = random.Random(order), lose
         self._workers = [self._make() for _ in range(self.count)]
         self._called, self._answers = [], 0
@@ -37,3 +44,33 @@ class Several(Workers):
     def close(self):
         for worker in self._workers:
             worker.close()
+
+
+class ToyBaker(Whole):
+    """Stands for `wlm.bake.work.HourBaker`, which needs Mitsuba: the light of an hour is the hour."""
+
+    def __init__(self, device, gather, points, scene, geometry, sky):
+        assert geometry.surfaces and not geometry.document.buffers
+        self._count = len(points)
+
+    def run(self, job):
+        for share in (0.5, 1.0):
+            self.report(share)
+        light = np.full((self._count, 3), job, np.float32)
+        return {"mean": light, "noise": light / 10, "back": np.zeros(self._count, np.float32)}
+
+
+class ToyWorker(Whole):
+    """Multiplies numbers by a factor; texts as tasks make it fail."""
+
+    def __init__(self, device, factor):
+        self._factor = factor
+
+    def run(self, job):
+        if job == "die":
+            os.kill(os.getpid(), signal.SIGKILL)
+        if job == "fail":
+            raise WlmError("a.exr: expected light")
+        if job == "sleep":
+            time.sleep(60.0)
+        return (lambda: 0) if job == "unsendable" else self._factor * job

@@ -119,7 +119,7 @@ def test_evaluate_prints_and_writes_the_report(fitted, room, tmp_path):
     report = evaluate(wlm.load(fitted), probes)
     stored = json.loads((tmp_path / "r.json").read_text())
     assert stored == report.to_json()
-    for word in (f"{report.psnr:.2f}", f"{report.irradiance_psnr:.2f}", f"{size:,}", "wlm tiny", "SH band 2"):
+    for word in (f"{report.psnr:.2f}", f"{report.irradiance_psnr:.2f}", f"{size:,}", "wlm tiny", "harmonics, band 2"):
         assert word in text
     said = [line.removeprefix("warning: ") for line in call.stderr.splitlines() if line.startswith("warning: ")]
     assert f"at the worst, probe {report.worst_probe['probe']} at (" in call.stderr and said == report.warnings

@@ -3,7 +3,6 @@
 import json
 import os
 import re
-from importlib import import_module
 
 import numpy as np
 import pytest
@@ -14,6 +13,7 @@ from builders.smoke_plumes import SPHERE, plume, write_frames
 from wlm.fluid.volume import load_volume, save_volume
 from wlm.formats.exr import read_planes
 from wlm.smoke.data import load_frames, read_shaded, read_six_way
+from wlm.smoke.frames import _METHODS
 from wlm.smoke.lightmaps import axis_faults
 from wlm.smoke.march.six_way import bake, with_surface
 from wlm.smoke.scene import CameraSettings, LightSettings, make_camera
@@ -43,20 +43,17 @@ def camera_of(volume, **settings):
 
 
 @pytest.mark.parametrize(
-    ("words", "place", "other"),
+    ("words", "method", "other"),
     [
-        (["bake", "--step", 1], "wlm.smoke.march.six_way.bake", ["--step", 2]),
-        pytest.param(
-            ["predict", "--coarse"], "wlm.smoke.march.six_way.bake_coarse", ["--seed", 7], marks=pytest.mark.slow
-        ),
+        (["bake", "--step", 1], "bake", ["--step", 2]),
+        pytest.param(["predict", "--coarse"], "coarse", ["--seed", 7], marks=pytest.mark.slow),
     ],
 )
-def test_frames_that_were_made_are_not_made_again(words, place, other, frames, tmp_path, monkeypatch):
+def test_frames_that_were_made_are_not_made_again(words, method, other, frames, tmp_path, monkeypatch):
     words = ["smoke", words[0], frames, *words[1:], "--resolution", 8]
     whole, out = tmp_path / "whole", tmp_path / "out"
     call(*words, "-o", whole)
-    (module, _, name), made = place.rpartition("."), []
-    make = getattr(import_module(module), name)
+    make, made = _METHODS[method], []
 
     def interrupted(*args, **options):
         made.append(1)
@@ -64,7 +61,7 @@ def test_frames_that_were_made_are_not_made_again(words, place, other, frames, t
             raise KeyboardInterrupt
         return make(*args, **options)
 
-    monkeypatch.setattr(place, interrupted)
+    monkeypatch.setitem(_METHODS, method, interrupted)
     call(*words, "-o", out, code=130)
     assert f"stopped at frame 2: repeat the command with --resume to continue from {out}/six.partial" in call.stderr
     names = ["six_0001.exr", "six_0002.exr", "six.partial"]

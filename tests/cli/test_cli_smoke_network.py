@@ -100,7 +100,7 @@ def test_a_training_is_stopped_and_resumed(trained, tmp_path, monkeypatch):
 def test_predict_marches_as_in_training(network, volume, tmp_path):
     out = tmp_path / "a.exr"
     text = call("smoke", "predict", volume, "-o", out, "--network", network, "--resolution", 20, "--seed", 4)
-    assert "mean light" in text and "error" not in text
+    assert "their mean light" in text and "error" not in text
     six = read_six_way(out)
     # A tenth of the 24 voxels of the longest edge.
     march = March(2.4, seed=4, threshold=4.0 / 24)

@@ -11,8 +11,9 @@ from wlm.fluid.faces import FACES
 from wlm.fluid.forcing import Fire, Turbulence, Wind
 from wlm.fluid.lattice import Lattice
 from wlm.fluid.obstacles import Sphere, Trajectory, box_mesh
-from wlm.fluid.slabs import Slabs
+from wlm.fluid.slabs import Slabs, _Divided
 from wlm.fluid.solver import SCHEMES, Buoyancy, Solver, Source
+from wlm_kernels.fluid.lattice_sets import Slab
 
 SHAPE = (11, 9, 10)
 RESTING = box_mesh(Trajectory.of([[5.5, 2.0, 5.0]]), (4.0, 2.5, 2.5))
@@ -134,6 +135,51 @@ def test_what_is_refused(device: str):
             Lattice(SHAPE, viscosity=0.1, device=names)
     with pytest.raises(ValueError, match="bricks: expected none on several devices"):
         Solver(Lattice(SHAPE, viscosity=0.1, device=f"{device},{device}"), bricks=True)
+
+
+class _Device:
+    """Stands for a GPU: notes what its stream waits for."""
+
+    def __init__(self, ordinal: int, log: list[str]) -> None:
+        self.ordinal, self.stream, self.is_capturing, self._log = ordinal, self, False, log
+
+    def wait_stream(self, other: "_Device") -> None:
+        self._log.append(f"{self.ordinal} waits for {other.ordinal}")
+
+
+def test_work_of_other_devices_is_between_that_of_the_first():
+    log: list[str] = []
+    slabs, devices = Slabs((3, 1, 1), ["cpu"] * 3), [_Device(k, log) for k in range(3)]
+    slabs.home, *slabs._others = devices
+    slabs.parts = [Slab(device, k, k + 1, k) for k, device in enumerate(devices)]
+    slabs.each(lambda slab: log.append(f"{slab.device.ordinal} computes"))
+    before, after = (["1 waits for 0", "2 waits for 0"], ["0 waits for 1", "0 waits for 2"])
+    assert log == [*before, "0 computes", "1 computes", "2 computes", *after]
+    slabs.home.is_capturing = True
+    with pytest.raises(ValueError, match="expected one GPU during the capture of a CUDA graph, got cpu,cpu,cpu"):
+        slabs.each(log.append)
+
+
+def test_rows_of_an_array_are_divided_among_devices(monkeypatch: pytest.MonkeyPatch):
+    """Each page of two rows of 80 bytes is said to be on one device, and mapped by all."""
+    said = []
+
+    class Driver:
+        def cuMemAdvise(self, start, size, advice, ordinal):
+            said.append((start.value - 1000, size.value, advice, ordinal))
+
+        def cuMemPrefetchAsync(self, start, size, ordinal, stream):
+            said.append((start.value - 1000, size.value, "moved", ordinal))
+
+    monkeypatch.setattr("ctypes.CDLL", lambda _name: Driver())
+    monkeypatch.setattr(wp.CudaManagedAllocator, "allocate", lambda self, size: 1000)
+    parts = [Slab(_Device(0, []), 0, 3), Slab(_Device(1, []), 3, 8, 1)]
+    assert _Divided(parts, 2).allocate(160) == 1000
+    for key in (3, "moved"):
+        assert [each for each in said if each[2] == key] == [
+            (start, size, key, ordinal) for start, size, ordinal in ((0, 30, 0), (30, 50, 1), (80, 30, 0), (110, 50, 1))
+        ]
+    assert sum(each[1] for each in said if each[2] == 5) == 2 * 160
 
 
 def test_free_memory_is_that_of_the_fullest_device(device: str, monkeypatch: pytest.MonkeyPatch):

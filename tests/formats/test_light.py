@@ -19,7 +19,7 @@ from wlm.formats.light import read_light
 
 RGB, RGBA = ("R", "G", "B"), ("R", "G", "B", "A")
 # Byte offsets, from the specifications.
-FORMAT, HEIGHT, LAYERS, FACES, SCHEME, DESCRIPTOR_AT, LEVEL = 12, 24, 32, 36, 44, 48, 80
+FORMAT, HEIGHT, LAYERS, FACES, SCHEME, DESCRIPTOR_AT, LEVEL, TRANSFER = 12, 24, 32, 36, 44, 48, 80, 118
 DDS_SIZE, DDS_HEIGHT, DDS_FLAGS, DDS_CODE, DDS_CAPS2 = 4, 12, 80, 84, 112
 DXGI, MISC, ARRAY = 128, 136, 140
 
@@ -174,28 +174,6 @@ def test_kinds_are_told_by_content(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("at", "value", "words"),
-    [
-        (FORMAT, 37, "BC6H or ASTC SFLOAT, found 37"),
-        (FORMAT, 97, "byteLength of level 0: expected 120 for 5 x 3 texels of R16G16B16A16_SFLOAT, found 90"),
-        (HEIGHT, 0, "pixelHeight: expected at least 1 (2D), found 0"),
-        (LAYERS, 3, "layerCount: expected 0 (no array), found 3"),
-        (FACES, 6, "faceCount: expected 1 (no cube), found 6"),
-        (SCHEME, 2, "level 0: cannot unpack: zstd: "),
-        (LEVEL, 500, "level 0: the file is cut short: expected 590 bytes"),
-        (DESCRIPTOR_AT, 2**31, "the data format descriptor: the file is cut short"),
-        (104 + 14, 2, "expected linear light (transfer function 1), found 2"),
-    ],
-)
-def test_a_wrong_field_of_ktx2_is_named(tmp_path, at, value, words):
-    content = bytearray(make_ktx2(90, 5, 3, [_light(3, 5).tobytes()], pairs={"KTXwriter": "a test"}))
-    content[at : at + 4] = struct.pack("<I", value) if at < 104 else bytes([value]) + content[at + 1 : at + 4]
-    (tmp_path / "a.ktx2").write_bytes(content)
-    message = error_of(read_light, tmp_path / "a.ktx2")
-    assert message.startswith(f"{tmp_path / 'a.ktx2'}: ") and words in message
-
-
-@pytest.mark.parametrize(
     ("pairs", "words"),
     [
         ({"KTXorientation": "rdi"}, "KTXorientation: expected rd, ru, ld or lu, found b'rdi'"),
@@ -210,24 +188,36 @@ def test_other_orders_are_refused(tmp_path, pairs, words):
 
 
 @pytest.mark.parametrize(
-    ("at", "value", "words"),
+    ("suffix", "at", "value", "words"),
     [
-        (DDS_SIZE, 125, "header size: expected 124, found 125"),
-        (DDS_HEIGHT, 4, "5 x 4 texels of R16G16B16A16_FLOAT: the file is cut short: expected 308 bytes, found 268"),
-        (DDS_FLAGS, 0x40, "pixel format: expected DX10, or FourCC 113 (A16B16G16R16F) or 116 (A32B32G32R32F), found"),
-        (DDS_CODE, 0x31545844, "found FourCC DXT1"),
-        (DDS_CAPS2, 0xFE00, "expected a 2D texture, found a cube"),
-        (DXGI, 98, "found 98 (BC7_UNORM)"),
-        (MISC, 4, "DX10 flags: expected no cube, found 0x4"),
-        (ARRAY, 6, "array size: expected 1 (no array), found 6"),
+        ("ktx2", FORMAT, 37, "BC6H or ASTC SFLOAT, found 37"),
+        ("ktx2", FORMAT, 97, "byteLength of level 0: expected 120 for 5 x 3 texels of R16G16B16A16_SFLOAT, found 90"),
+        ("ktx2", HEIGHT, 0, "pixelHeight: expected at least 1 (2D), found 0"),
+        ("ktx2", LAYERS, 3, "layerCount: expected 0 (no array), found 3"),
+        ("ktx2", FACES, 6, "faceCount: expected 1 (no cube), found 6"),
+        ("ktx2", SCHEME, 2, "level 0: cannot unpack: zstd: "),
+        ("ktx2", LEVEL, 500, "level 0: the file is cut short: expected 590 bytes"),
+        ("ktx2", DESCRIPTOR_AT, 2**31, "the data format descriptor: the file is cut short"),
+        ("ktx2", TRANSFER, 2, "expected linear light (transfer function 1), found 2"),
+        ("dds", DDS_SIZE, 125, "header size: expected 124, found 125"),
+        ("dds", DDS_HEIGHT, 4, "texels of R16G16B16A16_FLOAT: the file is cut short: expected 308 bytes, found 268"),
+        ("dds", DDS_FLAGS, 0x40, "expected DX10, or FourCC 113 (A16B16G16R16F) or 116 (A32B32G32R32F), found"),
+        ("dds", DDS_CODE, 0x31545844, "found FourCC DXT1"),
+        ("dds", DDS_CAPS2, 0xFE00, "expected a 2D texture, found a cube"),
+        ("dds", DXGI, 98, "found 98 (BC7_UNORM)"),
+        ("dds", MISC, 4, "DX10 flags: expected no cube, found 0x4"),
+        ("dds", ARRAY, 6, "array size: expected 1 (no array), found 6"),
     ],
 )  # fmt: skip
-def test_a_wrong_field_of_dds_is_named(tmp_path, at, value, words):
-    content = bytearray(make_dds(10, 5, 3, _light(3, 5, 4).tobytes()))
-    struct.pack_into("<I", content, at, value)
-    (tmp_path / "a.dds").write_bytes(content)
-    message = error_of(read_light, tmp_path / "a.dds")
-    assert message.startswith(f"{tmp_path / 'a.dds'}: ") and words in message
+def test_a_wrong_field_of_a_header_is_named(tmp_path, suffix, at, value, words):
+    content = bytearray(make_ktx2(90, 5, 3, [_light(3, 5).tobytes()], pairs={"KTXwriter": "a test"}))
+    if suffix == "dds":
+        content = bytearray(make_dds(10, 5, 3, _light(3, 5, 4).tobytes()))
+    content[at : at + 4] = bytes([value]) + content[at + 1 : at + 4] if at == TRANSFER else struct.pack("<I", value)
+    path = tmp_path / f"a.{suffix}"
+    path.write_bytes(content)
+    message = error_of(read_light, path)
+    assert message.startswith(f"{path}: ") and words in message
 
 
 def test_a_missing_package_is_named_with_the_file(tmp_path, monkeypatch):

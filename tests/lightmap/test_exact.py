@@ -3,7 +3,6 @@
 import dataclasses
 import math
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,14 +10,13 @@ import pytest
 from builders.checks import error_of
 from builders.lightmap_codes import codes_at, shares_of
 from builders.resigned import error_of_changed
-from builders.small_sets import moving_light, static_light, tiny_profile
+from builders.small_sets import moving_light, tiny_profile
 from builders.synthetic import any_blocks, random_model, random_sheet
 
 import wlm
 from benchmarks.lightmap_exact import bound64, colour_tile64, decode_tile64
 from benchmarks.rivals.lightmap import encode_set
 from wlm.errors import WlmError
-from wlm.formats.bc7 import pack_mode6
 from wlm.lightmap.data import from_arrays
 from wlm.lightmap.decode import SheetDecoder
 from wlm.lightmap.encodings.frames import choose_frames, round_half
@@ -50,8 +48,7 @@ TIMES = (0.0, 7.5, 10.0, 21.7)
 def test_the_decoder_agrees(settings, device):
     model = random_sheet(**settings)
     decoder = SheetDecoder(model, device)
-    maps = [kind for kind in (TileKind.STATIC, TileKind.DYNAMIC) if kind in model.kind]
-    runtimes = [ExactDecoder(model, device, kind=kind) for kind in maps]
+    runtimes = [ExactDecoder(model, device)]
     runtimes += [FrameDecoder(model, device) for _ in model.numbers(TileKind.FRAMES)[:1]]
     for time in TIMES:
         tiles = decoder.tiles(range(4), time)
@@ -62,38 +59,12 @@ def test_the_decoder_agrees(settings, device):
             colour = colour_tile64(model, number, time)
             np.testing.assert_allclose(colour**2.2, expected, rtol=1e-9, atol=1e-12)
         # Between two times that are decoded apart, what a bound cuts off before the mix is another matter.
-        for runtime in runtimes[len(model.axis.reads(time)) == 2 and len(maps) :]:
+        for runtime in runtimes[len(model.axis.reads(time)) == 2 :]:
             codes, most = codes_at(runtime, time), 0.51 if time in model.times else 1.51
             np.testing.assert_allclose(
                 runtime.bounds, [bound64(model, number, time) for number in runtime.numbers], rtol=1e-6
             )
             assert np.abs(codes[..., :3] - 255.0 * shares_of(model, runtime.numbers, time)).max() < most
-
-
-def test_a_network_that_passes_its_features_through():
-    """One texel by hand: the first layer reads F_uv's red alone, far on GELU's linear side, and the rest copies it."""
-    model = random_sheet(kinds=(2, 0), seed=3)
-    net = np.zeros_like(model.net_static)
-    hidden, width = net[0], model.profile.hidden
-    hidden[0 * width] = 1.0  # input 0 to unit 0
-    hidden[4 * width] = 64.0  # its bias, from where on GELU is the identity
-    hidden[5 * width] = 1.0  # unit 0 to unit 0 of the second layer
-    hidden[-3 * (width + 1)] = 1.0  # and to red
-    hidden[-3] = -64.0  # the bias taken off again
-    affine = np.zeros_like(model.affine)
-    affine[0, :, 0] = 2.0, 1.0
-    scale = np.full_like(model.scale_static, 8.0)
-    model = replace(model, net_static=net, affine=affine, scale_static=scale)
-    red = np.array([[64, 192]], np.float64) / 255.0
-    endpoints = np.zeros((1, 32, 32, 2, 4), np.uint8)
-    endpoints[..., 0, 0], endpoints[..., 1, 0] = 64, 192
-    indices = np.zeros((1, 32, 32, 16), np.uint8)
-    indices[..., 1::2] = 15
-    model = replace(model, uv=pack_mode6(endpoints, indices))
-    expected = 8.0 * (2.0 + (red - 0.5) * math.sqrt(12.0))
-    colour = colour_tile64(model, 0, 5.0)
-    np.testing.assert_allclose(colour[:, :, 0], np.tile(expected, (128, 64)), rtol=1e-12)
-    assert not colour[..., 1:].any()
 
 
 def test_what_is_not_there():
@@ -159,25 +130,24 @@ def test_two_states_are_as_good_as_bc7_in_as_many_bytes(two_hours, tmp_path):
         (moving_light(hours=(6.0, 12.0, 18.0)), {}, "dynamic"),
         (moving_light(hours=(6.0, 12.0, 18.0)), {"uvt_resolution": 64}, "frames"),
         (moving_light(hours=(6.0,)), {}, "frames"),
-        (static_light(hours=(6.0, 12.0)), {}, "static"),
-        (moving_light(hours=(6.0,)), {"frames": "never"}, "static"),
-        (static_light(hours=(6.0, 12.0)), {"frames": "always"}, "frames"),
+        (moving_light(hours=(6.0,)), {"frames": "never"}, "dynamic"),
+        (moving_light(hours=(6.0, 12.0, 18.0)), {"frames": "always"}, "frames"),
     ],
-    ids=["two", "three", "large maps", "one", "static", "never", "always"],
+    ids=["two", "three", "large maps", "one", "never", "always"],
 )
 def test_a_tile_is_frames_where_that_takes_no_more(lightmaps, settings, kind):
     profile, count = Profile.load("M").override(settings), len(lightmaps.times)
     kinds = classify(split(lightmaps.light, profile.gamma), profile.gamma)
     chosen = choose_frames(kinds, count, profile)
     assert ("frames" if chosen[0] else TileKind(kinds[0]).name.lower()) == kind
-    assert "frames" in settings or chosen[0] == (count * 16384 < tile_bytes(profile, kinds[0] == TileKind.DYNAMIC))
+    assert "frames" in settings or chosen[0] == (count * 16384 < tile_bytes(profile))
 
 
 def test_without_the_encoder_a_network_is_fitted_and_that_is_said(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "ispc_texcomp", None)
     lightmaps = moving_light(hours=(6.0,))
     model = compress(lightmaps, tiny_profile(frames="auto"))
-    assert count_kinds(model.sheets[LIGHT])["static"] == 1
+    assert count_kinds(model.sheets[LIGHT])["dynamic"] == 1
     assert len(model.warnings) == 1 and "1 tile would take" in model.warnings[0]
     assert "pip install 'wlm[frames]'" in model.warnings[0] and "\n" not in model.warnings[0]
     with pytest.raises(WlmError, match=r"^frames: ispc_texcomp is missing; needs the extra"):

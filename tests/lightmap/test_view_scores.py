@@ -113,17 +113,6 @@ def test_an_error_that_is_the_same_everywhere_is_seen_as_it_is(shape):
     assert score.border == pytest.approx(1.0, abs=1e-5) if shape[1] > 128 else math.isnan(score.border)
 
 
-def test_a_filter_smooths_noise():
-    """The weights' squares sum to (2/3)^2 in the mean, so the error falls by 3.52 dB."""
-    still = light(256, 256)
-    noise = np.random.default_rng(0).normal(0.0, 0.01, still.frames.shape).astype(np.float32)
-    score = scored(still, still.frames + noise)
-    assert score.seen == pytest.approx(db(0.01 * 2 / 3), abs=0.1)
-    assert score.border == pytest.approx(1.0, abs=0.03)
-    # The same points in every run.
-    assert score.seen == scored(still, still.frames + noise).seen
-
-
 def test_errors_at_borders_of_tiles_stand_out():
     still = light(128, 256)
     error = np.zeros((128, 256, 1), np.float32)

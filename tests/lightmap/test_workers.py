@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from builders.running import report_always
-from builders.small_sets import moving_light, static_light, tiny_profile, write_set
+from builders.small_sets import moving_light, tiny_profile, write_set
 from builders.worker_pools import Several
 
 import wlm
@@ -32,10 +32,9 @@ PROFILE = tiny_profile(steps=40)
 
 @pytest.fixture
 def lightmaps(monkeypatch):
-    """Two static tiles beside four dynamic ones, each a batch of its own."""
+    """Six tiles, each a batch of its own."""
     monkeypatch.setattr(fit, "CPU_TILES", 1)
-    static, moving = static_light(256, 128).light, moving_light(256, 256).light
-    return from_arrays(np.concatenate([static.frames, moving.frames], axis=2), moving.times, period=24.0)
+    return moving_light(256, 384)
 
 
 def bytes_of(model, folder):
@@ -56,7 +55,7 @@ def test_the_order_of_answers_and_lost_workers_change_nothing(lightmaps, tmp_pat
     whole = bytes_of(fit.compress(lightmaps, profile), tmp_path)
     checkpoint = fit.open_checkpoint(tmp_path / "a.wlm", lightmaps, profile, every=0)
     for order, lose, kept in ((1, (), None), (2, (1, 9, 20, 21), checkpoint)):
-        monkeypatch.setattr(fit, "start_workers", functools.partial(Several, order=order, lose=lose))
+        monkeypatch.setattr(dispatch, "start_workers", functools.partial(Several, order=order, lose=lose))
         assert bytes_of(fit.compress(lightmaps, profile, workers=3, checkpoint=kept), tmp_path) == whole
 
 
@@ -64,7 +63,7 @@ def test_what_several_workers_were_at_is_resumed_by_another_number(lightmaps, tm
     report_always(monkeypatch)
     whole = bytes_of(fit.compress(lightmaps, PROFILE), tmp_path)
     with monkeypatch.context() as patched:
-        patched.setattr(fit, "start_workers", Several)
+        patched.setattr(dispatch, "start_workers", Several)
         checkpoint = fit.open_checkpoint(tmp_path / "a.wlm", lightmaps, PROFILE)
         with pytest.raises(KeyboardInterrupt):
             fit.compress(lightmaps, PROFILE, workers=3, progress=stop_after(100), checkpoint=checkpoint)
@@ -77,7 +76,7 @@ def test_what_several_workers_were_at_is_resumed_by_another_number(lightmaps, tm
 
 
 def test_a_batch_that_no_worker_survives_is_named(lightmaps, monkeypatch):
-    monkeypatch.setattr(fit, "start_workers", functools.partial(Several, lose=range(100)))
+    monkeypatch.setattr(dispatch, "start_workers", functools.partial(Several, lose=range(100)))
     with pytest.raises(WlmError, match="^fit: 3 workers died of task 0: it was unlucky$"):
         fit.compress(lightmaps, PROFILE, workers=2)
 
@@ -104,25 +103,6 @@ def processes_of(parent):
         except OSError:
             continue
     return found
-
-
-@pytest.mark.slow
-def test_a_killed_process_changes_nothing(lightmaps, tmp_path, monkeypatch):
-    profile = tiny_profile(steps=400)
-    whole = bytes_of(fit.compress(lightmaps, profile), tmp_path)
-    killed = []
-
-    def kill(progress):
-        # One of two that are at work: both have batches by then.
-        if progress.done > 500 and not killed:
-            killed.extend(processes_of(os.getpid())[:1])
-            os.kill(killed[0], signal.SIGKILL)
-
-    report_always(monkeypatch)
-    checkpoint = fit.open_checkpoint(tmp_path / "a.wlm", lightmaps, profile, every=0.1)
-    model = fit.compress(lightmaps, profile, workers=2, progress=kill, checkpoint=checkpoint)
-    assert bytes_of(model, tmp_path) == whole
-    assert killed and processes_of(os.getpid()) == []
 
 
 @pytest.mark.slow
@@ -181,36 +161,6 @@ def test_a_process_answers_or_says_why_not():
     finally:
         workers.close()
     assert processes_of(os.getpid()) == before
-
-
-@pytest.mark.slow
-def test_a_cluster_gives_the_same_bytes(lightmaps, tmp_path, monkeypatch):
-    ray = pytest.importorskip("ray")
-    whole = bytes_of(fit.compress(lightmaps, PROFILE), tmp_path)
-    ray.init(num_cpus=4, include_dashboard=False, log_to_driver=False)
-    try:
-        made = []
-        begin = dispatch.Actors.__init__
-
-        def remember(self, *arguments):
-            begin(self, *arguments)
-            made.append(self)
-
-        monkeypatch.setattr(dispatch.Actors, "__init__", remember)
-        report_always(monkeypatch)
-        killed = []
-
-        def kill(progress):
-            if progress.done >= 60 and not killed:
-                killed.append(made[0]._actors[0])
-                ray.kill(killed[0])
-
-        assert bytes_of(fit.compress(lightmaps, PROFILE, cluster="auto", progress=kill), tmp_path) == whole
-        assert made[0].count == 2 and killed
-        with pytest.raises(WlmError, match="cluster auto: expected 1 GPU for a worker"):
-            fit.compress(lightmaps, PROFILE, cluster="auto", device="cuda")
-    finally:
-        ray.shutdown()
 
 
 def test_a_mapped_set_is_the_same_set(tmp_path, monkeypatch):

@@ -174,7 +174,7 @@ def relative_error(model, probes):
 def test_small_sets_keep_each_probes_light(count):
     probes = synthetic(count, dead=3 if count > 5 else 0)
     model = wlm.probe.compress(probes)
-    assert model.method == "pca" and model.choice.startswith("PCA: ") and "Gaussians take" in model.choice
+    assert model.method == "pca" and "principal components: " in model.choice and "Gaussians take" in model.choice
     error = relative_error(model, probes)
     assert np.sqrt(np.mean(error**2)) <= ENOUGH and error.max() < 5 * ENOUGH
     assert (model.decoder().decode_probes()[~probes.live] == 0).all()
@@ -309,10 +309,10 @@ def test_the_choice_is_by_error_at_equal_gpu_bytes():
     # Light that is smooth over thousands of probes suits Gaussians; white noise suits neither, and stays PCA's.
     smooth = synthetic(1500)
     model = wlm.probe.compress(smooth, Profile(name="tiny", ratio=0.01, latent=3, hidden=8, steps=600))
-    assert model.method == "gaussians" and model.choice.startswith("Gaussians: ")
+    assert model.method == "gaussians" and model.choice.startswith("Gaussians have an error of ")
     assert model.profile.method == "gaussians"
     unfinished = wlm.probe.compress(smooth, Profile(name="tiny", ratio=0.3, latent=3, hidden=16, steps=10))
-    assert unfinished.method == "pca" and "PCA: " in unfinished.choice
+    assert unfinished.method == "pca" and "principal components: " in unfinished.choice
     assert unfinished.profile == Profile(name="tiny", method="pca")
 
 
@@ -354,7 +354,7 @@ def test_a_target_and_a_number_of_bytes_choose_the_model():
     for most in (900, 2600):
         model = compress(probes, SEARCH, max_bytes=most)
         assert 0.5 * most < model.content.nbytes <= most
-        assert re.match(r"(PCA|Gaussians): .* reach [\d.]+% in [\d,]+", model.choice)
+        assert re.match(r"(principal components|Gaussians): .* an error of [\d.]+% in [\d,]+", model.choice)
     warning = compress(probes, SEARCH, target=0.03, max_bytes=900, method="pca").warnings[0]
     assert re.fullmatch(r"room: target: the relative error is [\d.]+%, more than the 3.0% asked for", warning)
     with pytest.raises(WlmError, match="room: max_bytes: expected more bytes, as no model of 200 probes fits 60"):

@@ -605,14 +605,6 @@ def test_figures_are_those_of_the_readings(device: str):
         assert last[name] == pytest.approx(20.0 * np.log10(peak / rms(error)))
 
 
-def test_a_second_lap_decodes_nothing():
-    position = _hills()
-    path, volume = camera_path(position, 30), _volume(position, side=16, budget=1024)
-    first, second = (walk(volume, path, _field(position)) for _ in range(2))
-    assert first["updated"]["max"] > 0 and second["updated"]["max"] == second["probes"]["max"] == 0
-    assert second["left"]["max"] == 0 and second["light_psnr"] == first["light_psnr"] == 120.0
-
-
 def test_a_walk_where_no_probe_is():
     """Frames without a near sample have no coverage and no error: here between two hills."""
     position = np.concatenate([_hills(), _hills() + [1000.0, 0.0, 0.0]])

@@ -1,5 +1,6 @@
 """Marching through a density grid in float64 NumPy: every sample marches to its light alone, nothing is shared."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -58,19 +59,27 @@ def span(shape: tuple, o: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.nda
     return near.max(-1), far.min(-1)
 
 
-def depth_to(scene: Scene, p: np.ndarray, toward: np.ndarray, h: float) -> np.ndarray:
-    """Optical depth from points [..., 3] towards a light, in equal steps no longer than h."""
-    near, far = span(scene.density.shape, p, np.broadcast_to(toward, p.shape))
+def samples(
+    scene: Scene, o: np.ndarray, d: np.ndarray, h: float
+) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Samples of rays [..., 3] from their origins on, in equal steps no longer than h: distances, lengths of the steps,
+    and densities, 0 for a ray with fewer samples."""
+    near, far = span(scene.density.shape, o, d)
     first = np.maximum(near, 0.0)
     length = np.maximum(far - first, 0.0)
     steps = np.ceil(length / h)
     dt = length / np.maximum(steps, 1)
-    total = np.zeros(p.shape[:-1])
     for n in range(int(steps.max(initial=0))):
-        s = first + (n + 0.5) * dt
-        q = p + np.where(n < steps, s, 0.0)[..., None] * toward
-        total += np.where(n < steps, trilinear(scene.density, q), 0.0)
-    return total * dt * scene.extinction
+        s = np.where(n < steps, first + (n + 0.5) * dt, 0.0)
+        yield s, dt, np.where(n < steps, trilinear(scene.density, o + s[..., None] * d), 0.0)
+
+
+def depth_to(scene: Scene, p: np.ndarray, toward: np.ndarray, h: float) -> np.ndarray:
+    """Optical depth from points [..., 3] towards a light, in equal steps no longer than h."""
+    total = np.zeros(p.shape[:-1])
+    for _, dt, density in samples(scene, p, np.broadcast_to(toward, p.shape), h):
+        total += density * dt
+    return total * scene.extinction
 
 
 def phase(g: float, cosine) -> np.ndarray:
@@ -81,18 +90,10 @@ def phase(g: float, cosine) -> np.ndarray:
 def guide(scene: Scene, step: float, g: float, threshold: float) -> np.ndarray:
     """Algorithm 1 without jitter, marching from each sample: light, transparency, depth, [3, H, W]."""
     o, d = scene.rays()
-    near, far = span(scene.density.shape, o, d)
-    first = np.maximum(near, 0.0)
-    length = np.maximum(far - first, 0.0)
-    steps = np.ceil(length / step)
-    dt = length / np.maximum(steps, 1)
-    light, t, depth = np.zeros(steps.shape), np.ones(steps.shape), np.zeros(steps.shape)
+    light, t, depth = np.zeros(d.shape[:2]), np.ones(d.shape[:2]), np.zeros(d.shape[:2])
     rise = d @ scene.up
-    for n in range(int(steps.max(initial=0))):
-        on = n < steps
-        s = np.where(on, first + (n + 0.5) * dt, 0.0)
-        p = o + s[..., None] * d
-        sigma = np.where(on, scene.extinction * trilinear(scene.density, p), 0.0)
+    for s, dt, density in samples(scene, o, d, step):
+        p, sigma = o + s[..., None] * d, scene.extinction * density
         depth = np.where((depth == 0) & (sigma > threshold), s, depth)
         x = sigma * dt
         sides = phase(g, rise) * np.exp(-depth_to(scene, p, scene.up, step))
@@ -102,27 +103,13 @@ def guide(scene: Scene, step: float, g: float, threshold: float) -> np.ndarray:
     return np.stack([light, t, depth])
 
 
-def nodes(scene: Scene, step: float) -> np.ndarray:
-    """Optical depths to the top and bottom at the lattice's nodes, [A, B, C, 2]."""
-    axes = [np.linspace(-0.5, n + 0.5, int(np.ceil((n + 1) / step)) + 1) for n in scene.density.shape]
-    p = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
-    return np.stack([depth_to(scene, p, way, step) for way in (scene.up, -scene.up)], -1)
-
-
 def lit(scene: Scene, toward: np.ndarray, step: float, g: float) -> np.ndarray:
     """Single scattering under one light, [H, W]."""
     o, d = scene.rays()
-    near, far = span(scene.density.shape, o, d)
-    first = np.maximum(near, 0.0)
-    length = np.maximum(far - first, 0.0)
-    steps = np.ceil(length / step)
-    dt = length / np.maximum(steps, 1)
-    light, tau = np.zeros(steps.shape), np.zeros(steps.shape)
-    for n in range(int(steps.max(initial=0))):
-        s = np.where(n < steps, first + (n + 0.5) * dt, 0.0)
-        p = o + s[..., None] * d
-        x = np.where(n < steps, scene.extinction * trilinear(scene.density, p) * dt, 0.0)
-        light += np.exp(-tau - depth_to(scene, p, toward, step)) * (1 - np.exp(-x))
+    light, tau = np.zeros(d.shape[:2]), np.zeros(d.shape[:2])
+    for s, dt, density in samples(scene, o, d, step):
+        x = scene.extinction * density * dt
+        light += np.exp(-tau - depth_to(scene, o + s[..., None] * d, toward, step)) * (1 - np.exp(-x))
         tau += x
     return light * phase(g, d @ toward)
 
@@ -140,19 +127,19 @@ def six_way(
     near, far = depths.min(), depths.max()
     o, d = scene.rays()
 
-    def samples(first: float, last: float) -> tuple[np.ndarray, float]:
+    def planes(first: float, last: float) -> tuple[np.ndarray, float]:
         count = max(int(np.ceil((last - first) / step)), 0)
         dz = (last - first) / max(count, 1)
         return first + (np.arange(count) + 0.5) * dz, dz
 
     def column(first: float, last: float) -> np.ndarray:
-        at, dz = samples(first, last)
+        at, dz = planes(first, last)
         return sum((trilinear(scene.density, o + s * d) * dz * scene.extinction for s in at), np.zeros(o.shape[:2]))
 
     behind, ahead = column(near, min(far, 0.0)), column(max(near, 0.0), far)
     ds = scene.pitch / max(1, np.ceil(scene.pitch / step))
     reach = int(np.ceil(np.linalg.norm(scene.density.shape) * 1.5 / ds)) + 1
-    at, dz = samples(max(near, 0.0), far)
+    at, dz = planes(max(near, 0.0), far)
     out = np.zeros((8, *o.shape[:2]))
     tau = np.zeros(o.shape[:2])
     for s in at:

@@ -3,6 +3,7 @@
 import csv
 import math
 from dataclasses import replace
+from unittest import mock
 
 import pytest
 import torch
@@ -13,6 +14,7 @@ import wlm
 from wlm.errors import WlmError
 from wlm.smoke.evaluation import of_network, score
 from wlm.smoke.fit import train
+from wlm.smoke.network import dataset
 from wlm.smoke.network.planes import GUIDES, OPACITY_PLANE, PLANES, Pool
 from wlm.smoke.network.settings import NetworkSettings, Profile, TrainSettings
 from wlm.smoke.network.trainer import Plan, Trainer, plan_round
@@ -26,7 +28,7 @@ def _profile(network: NetworkSettings = TINY, **training) -> Profile:
     return Profile(name="tiny", network=network, training=TrainSettings(**settings))
 
 
-def _pool(settings, *, seed, round, device, progress) -> Pool:
+def _pool(settings, *, seed, round, device, **options) -> Pool:
     return small_pool(4, 10 * (seed + 1) + 4 * round, 16).to(device)
 
 
@@ -40,12 +42,13 @@ def _interrupted(settings, **options) -> Pool:
     raise KeyboardInterrupt
 
 
-def _validation(settings, device, progress) -> Pool:
+def _validation(settings, device, **options) -> Pool:
     return small_pool(2, resolution=16).to(device)
 
 
-def _train(path, profile, **options):
-    return train(profile, path, **{"make_pool": _pool, "make_validation": _validation} | options)
+def _train(path, profile, make_pool=_pool, make_validation=_validation, **options):
+    with mock.patch.multiple(dataset, make_pool=make_pool, make_validation=make_validation):
+        return train(profile, path, **options)
 
 
 def _curves(path) -> list[dict[str, float]]:

@@ -11,7 +11,7 @@ from wlm.atlas.views import Points, corner_weights, texel_triangles
 from wlm.errors import WlmError
 from wlm.texels import fill_gaps
 from wlm_kernels.atlas import decode
-from wlm_kernels.raster import texture
+from wlm_kernels.raster import mips
 
 _TEXELS_AT_ONCE = 1 << 24
 
@@ -105,10 +105,10 @@ class Decoder:
         else:
             if model.lut.size:
                 place = torch.empty((len(out), 2), device=out.device)
-                texture.sample(self._lut, uv, interop.to_warp(place))
+                mips.sample(self._lut, uv, interop.to_warp(place))
                 # The triangle wave of eq. 8 is the identity on what 16 bits without a sign hold.
                 uv = interop.to_warp(place, wp.vec2)
-            texture.sample(self._texels, uv, interop.to_warp(out))
+            mips.sample(self._texels, uv, interop.to_warp(out))
 
     def __call__(self, points: Points, state: float = 0.0) -> torch.Tensor:
         """Returns light at N surface points of the scene in a state (a fraction lies between two), float32 [N, 3]."""

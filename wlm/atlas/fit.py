@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from wlm import interop
 from wlm.atlas import colour
 from wlm.atlas.cascade.fit import fit_cascade, group_triangles
 from wlm.atlas.data import LightmappedScene
@@ -26,6 +25,7 @@ from wlm.atlas.stored import store
 from wlm.atlas.tiles.fit import fit_tiles
 from wlm.atlas.views import Points, corner_weights
 from wlm.atlas.weights import FineGrid, weights
+from wlm.dispatch import Place
 from wlm.errors import WlmError
 from wlm.formats.checkpoint import EVERY, Checkpoint
 from wlm.formats.hdr_blocks import need
@@ -46,6 +46,8 @@ def compress(
     *,
     seed: int = 0,
     device: str = "cpu",
+    workers: int | None = None,
+    cluster: str | None = None,
     progress: OnProgress | None = None,
     checkpoint: Checkpoint | None = None,
     **settings: Any,
@@ -57,6 +59,8 @@ def compress(
         profile: The settings: a profile's name, a YAML file or a `Profile`.
         seed: Seed of random choices, such as views.
         device: "cpu" or "cuda:N".
+        workers, cluster: Where tiles that lightmaps share are tried side by side, with the same result: see
+            `wlm.dispatch.Place`.
         progress: Called as each stage begins, and about twice a second in stages of many steps.
         checkpoint: From `open_checkpoint` for the same settings, or None: keeps a running compression, so that an
             interrupted one can be resumed.
@@ -72,7 +76,8 @@ def compress(
         KeyboardInterrupt: Raised by `progress`, after the finished work of long stages has been written to the
             checkpoint, if there is one; other stages run again on resuming.
     """
-    device = interop.check_device(device)
+    place = Place(device, workers, cluster)
+    device = place.here
     profile, method = Profile.load(profile).override(settings).checked(len(scene.sheets) * len(scene.states))
     for sheet in scene.sheets:
         check_sides("size", *sheet.mask.shape[::-1])
@@ -80,6 +85,7 @@ def compress(
         if choice in _PACKAGES:  # a missing package is reported now, not after minutes
             need(_PACKAGES[choice], "atlas")
     stages = Stages(device, progress, checkpoint)
+    stages.place = place
     try:
         with one_thread(device):
             fit = fit_shared if method == "shared" else functools.partial(_fit_one, method)

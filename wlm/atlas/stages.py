@@ -6,13 +6,15 @@ from contextlib import contextmanager
 import numpy as np
 import torch
 
+from wlm.dispatch import Place
 from wlm.formats.checkpoint import Checkpoint
 from wlm.formats.parts import Part
 from wlm.system import Meter, OnProgress
 
 
 class Stages:
-    """Reports and times the stages of a compression: `seconds` of the finished ones, by name.
+    """Reports and times the stages of a compression: `seconds` of the finished ones, by name. `place` is where tasks of
+    long stages run, and `device` that of all other work.
 
     A checkpoint saves the results of long stages as batches, numbered in order. The progress callback is also called
     within stages of many steps.
@@ -20,6 +22,7 @@ class Stages:
 
     def __init__(self, device: str, progress: OnProgress | None = None, checkpoint: Checkpoint | None = None) -> None:
         self.device, self.progress, self.checkpoint = device, progress, checkpoint
+        self.place = Place(device)
         self.seconds: dict[str, float] = {}
 
     @contextmanager

@@ -4,13 +4,15 @@ import json
 import os
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from wlm.bake.backend import start
 from wlm.bake.geometry import Geometry, check_lamps, read_geometry
 from wlm.bake.texels import Texels, place_texels
-from wlm.bake.work import Task, each_hour, noise_share
+from wlm.bake.work import Bake, each_hour, noise_share
+from wlm.dispatch import Place
 from wlm.errors import WlmError, one_line
 from wlm.formats.checkpoint import Checkpoint
 from wlm.formats.exr import HALF_MAX, write_exr, write_planes
@@ -18,7 +20,6 @@ from wlm.formats.folder import compact_json, staged
 from wlm.formats.gltf_writer import write_glb
 from wlm.formats.hdr_blocks import need
 from wlm.formats.mask import write_mask
-from wlm.formats.parts import Part
 from wlm.system import OnProgress
 from wlm.texels import fill_gaps
 
@@ -61,7 +62,7 @@ class BakedLightmaps:
 
 
 def bake_lightmaps(
-    task: Task, *, device: str = "cpu", checkpoint: Checkpoint | None = None, progress: OnProgress | None = None
+    task: Bake, *, checkpoint: Checkpoint | None = None, progress: OnProgress | None = None, **place: Any
 ) -> BakedLightmaps:
     """Bakes the lightmap of a scene at each of its hours.
 
@@ -70,38 +71,23 @@ def bake_lightmaps(
     Args:
         task: The scene, from `wlm.bake.work.open_task`.
         checkpoint: From `wlm.bake.work.open_checkpoint`; None: the bake can't be resumed.
-        device: "cpu" or "cuda" (the first GPU).
         progress: Called from time to time; a KeyboardInterrupt that it raises leaves a written checkpoint.
+        place: `device`, "cpu" or "cuda" (the first GPU), and `workers` and `cluster`, by which hours are baked side by
+            side with the same result: see `wlm.dispatch.Place`.
 
     Raises:
         WlmError: Mitsuba, LLVM or a GPU is missing, the geometry can't be read, lacks lightmap UVs or they overlap, or
             a lamp names a material that doesn't exist.
     """
-    scene = task.scene
-    start(device)
+    scene, where = task.scene, Place(**place)
+    if where.cluster is None:
+        start(where.device)
     denoise = need("pyoidn", "bake").denoise if scene.denoise else None
-    # Both modules can only be imported after Mitsuba's variant is set.
-    from wlm.bake.paths import irradiance
-    from wlm.bake.world import make_hour
-
     geometry = read_geometry(task.geometry, scene.lightmap, task.trust)
     check_lamps(task.path, scene, geometry)
     texels = place_texels(str(task.geometry), geometry.surfaces, scene.lightmap.resolution, scene.lightmap.supersample)
-    hours = sorted(scene.hours)
-
-    def make(hour: float, report) -> dict[str, np.ndarray]:
-        world, tracing = make_hour(scene, geometry, task.sky, hour)
-        gathered = irradiance(world, texels, tracing, report=report)
-        light, noise = (np.minimum(values, HALF_MAX) for values in (gathered.mean, gathered.noise))
-        return {"light": light, "noise": noise, "back": gathered.back}
-
-    count = len(texels.index)
-    table = {
-        "light": Part(np.float32, (count, 3), least=0.0),
-        "noise": Part(np.float32, (count, 3), least=0.0),
-        "back": Part(np.float32, (count,), least=0.0, most=1.0),
-    }
-    results = each_hour(hours, checkpoint, table, make, progress)
+    shape = len(texels.index), 3
+    results = each_hour(task, geometry, "irradiance", texels, shape, where, checkpoint, progress)
     back = np.mean([each["back"] for each in results], axis=0)
     visible = back <= _HIDDEN
     if not visible.any():
@@ -109,16 +95,15 @@ def bake_lightmaps(
             f"{task.geometry}: every texel is inside an object, by the faces around it: turn its faces round"
         )
     mask = texels.image(visible.astype(np.float32)) > 0
-    light = np.stack([_finished(texels, each["light"], mask, denoise).astype(np.float16) for each in results])
-    noise = np.stack([texels.image(each["noise"]).astype(np.float16) for each in results])
-    return BakedLightmaps(
-        tuple(hours), light, noise, mask, texels.image(texels.coverage), texels.image(back.astype(np.float32)), geometry
-    )
+    light = np.stack([_finished(texels, each["mean"], mask, denoise).astype(np.float16) for each in results])
+    noise = np.stack([texels.image(np.minimum(each["noise"], HALF_MAX)).astype(np.float16) for each in results])
+    hours, shares = tuple(sorted(scene.hours)), (texels.image(texels.coverage), texels.image(back.astype(np.float32)))
+    return BakedLightmaps(hours, light, noise, mask, *shares, geometry)
 
 
 def _finished(texels: Texels, values: np.ndarray, mask: np.ndarray, denoise) -> np.ndarray:
     """Makes an image of the texels' values; gaps take the nearest value, and `denoise`, unless None, filters it."""
-    picture = fill_gaps(texels.image(values), mask)
+    picture = fill_gaps(texels.image(np.minimum(values, HALF_MAX)), mask)
     if denoise is not None:
         try:
             picture = denoise(np.ascontiguousarray(picture), filter_type="RTLightmap")
@@ -128,7 +113,7 @@ def _finished(texels: Texels, values: np.ndarray, mask: np.ndarray, denoise) -> 
     return picture
 
 
-def write_lightmaps(folder: str | os.PathLike[str], task: Task, baked: BakedLightmaps) -> list[Path]:
+def write_lightmaps(folder: str | os.PathLike[str], task: Bake, baked: BakedLightmaps) -> list[Path]:
     """Writes a lightmap set for `wlm compress`, replacing an earlier one, and returns the paths of its files.
 
     Raises:

@@ -3,17 +3,18 @@
 import os
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from wlm.bake.backend import start
 from wlm.bake.geometry import Geometry, check_lamps, read_geometry
 from wlm.bake.settings import ProbeSettings
-from wlm.bake.work import Task, each_hour, noise_share
+from wlm.bake.work import Bake, each_hour, noise_share
+from wlm.dispatch import Place
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_path
 from wlm.formats.checkpoint import Checkpoint
-from wlm.formats.parts import Part
 from wlm.probe.conventions import CANONICAL
 from wlm.system import OnProgress
 
@@ -54,43 +55,30 @@ def place_probes(settings: ProbeSettings, geometry: Geometry) -> np.ndarray:
 
 
 def bake_probes(
-    task: Task, *, device: str = "cpu", checkpoint: Checkpoint | None = None, progress: OnProgress | None = None
+    task: Bake, *, checkpoint: Checkpoint | None = None, progress: OnProgress | None = None, **place: Any
 ) -> BakedProbes:
     """Bakes a scene's probes at each of its hours.
 
     Args:
-        task, device, checkpoint, progress: As for `wlm.bake.bake_lightmaps`.
+        task, checkpoint, progress, place: As for `wlm.bake.bake_lightmaps`.
 
     Raises:
         WlmError: Mitsuba, LLVM or a GPU is missing, the geometry can't be read, there are too many probes, or a lamp
             names a material that doesn't exist.
     """
-    scene = task.scene
-    start(device)
-    # Both modules can only be imported after Mitsuba's variant is set.
-    from wlm.bake.paths import harmonics
-    from wlm.bake.world import make_hour
-
+    scene, where = task.scene, Place(**place)
+    if where.cluster is None:
+        start(where.device)
     geometry = read_geometry(task.geometry, None, task.trust)
     check_lamps(task.path, scene, geometry)
     position = place_probes(scene.probes, geometry)
     hours = sorted(scene.hours)
 
-    def make(hour: float, report) -> dict[str, np.ndarray]:
-        world, tracing = make_hour(scene, geometry, task.sky, hour)
-        gathered = harmonics(world, position, tracing, report=report)
-        return {"values": gathered.mean, "noise": gathered.noise, "back": gathered.back}
-
     count = len(position)
-    table = {
-        "values": Part(np.float32, (count, _NUMBERS)),
-        "noise": Part(np.float32, (count, _NUMBERS), least=0.0),
-        "back": Part(np.float32, (count,), least=0.0, most=1.0),
-    }
-    results = each_hour(hours, checkpoint, table, make, progress)
+    results = each_hour(task, geometry, "harmonics", position, (count, _NUMBERS), where, checkpoint, progress)
     hidden = np.mean([each["back"] for each in results], axis=0) > _HIDDEN
     shape = (len(hours), count, 9, 3)
-    values = np.stack([np.where(hidden[:, None], 0.0, each["values"]) for each in results]).astype(np.float32)
+    values = np.stack([np.where(hidden[:, None], 0.0, each["mean"]) for each in results]).astype(np.float32)
     noise = np.stack([each["noise"] for each in results])
     return BakedProbes(tuple(hours), position, values.reshape(shape), noise.reshape(shape))
 

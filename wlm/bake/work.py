@@ -3,14 +3,18 @@
 import hashlib
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from wlm.bake.backend import start
+from wlm.bake.geometry import Geometry
 from wlm.bake.settings import BakeScene
 from wlm.config import load_settings
+from wlm.dispatch import Place, Task, Whole, gathered
 from wlm.errors import WlmError
 from wlm.formats.checkpoint import Checkpoint
 from wlm.formats.light import read_light
@@ -23,7 +27,7 @@ _REPORTS = 100  # progress reports per hour
 
 
 @dataclass(frozen=True, eq=False)
-class Task:
+class Bake:
     """A scene file and the files that it refers to: the settings, the YAML file, the glTF file, and the environment
     map, float32 [H, W, 3] or None. `source` is a hash of geometry and map, 32 hexadecimal digits of BLAKE2b; `trust`
     tells whether the files may refer to files outside their folder.
@@ -37,7 +41,7 @@ class Task:
     trust: bool
 
 
-def open_task(path: str | os.PathLike[str], trust: bool = False) -> Task:
+def open_task(path: str | os.PathLike[str], trust: bool = False) -> Bake:
     """Reads a scene file and its environment map.
 
     With `trust` the file may refer to files outside its folder.
@@ -57,11 +61,11 @@ def open_task(path: str | os.PathLike[str], trust: bool = False) -> Task:
         if sky.shape[1] != 2 * sky.shape[0]:
             raise WlmError(f"{picture}: expected an image twice as wide as high, found {sky.shape[1]}x{sky.shape[0]}")
         digest.update(sky)
-    return Task(scene, Path(path), geometry, sky, digest.hexdigest(), trust)
+    return Bake(scene, Path(path), geometry, sky, digest.hexdigest(), trust)
 
 
 def open_checkpoint(
-    output: str | os.PathLike[str], task: Task, what: str, device: str, *, resume: bool = False
+    output: str | os.PathLike[str], task: Bake, what: str, device: str, *, resume: bool = False
 ) -> Checkpoint:
     """Opens the file beside `output` that stores a bake's finished hours; `what` is "lightmaps" or "probes".
 
@@ -81,37 +85,47 @@ def noise_share(values: np.ndarray, noise: np.ndarray) -> float:
     return math.sqrt(error / power) if power else 0.0
 
 
+class HourBaker(Whole):
+    """Bakes hours of a scene at points: `gather` is the function of `wlm.bake.paths` that takes them, and `world` the
+    arguments of `wlm.bake.world.make_hour`."""
+
+    def __init__(self, device: str, gather: str, points: Any, *world: Any) -> None:
+        start(device.partition(":")[0])
+        self._gather, self._points, self._world = gather, points, world
+
+    def run(self, job: float) -> dict[str, np.ndarray]:
+        """Returns the arrays of an hour, as `wlm.bake.paths.Gathered` has them."""
+        # Both modules can only be imported after Mitsuba's variant is set.
+        from wlm.bake import paths
+        from wlm.bake.world import make_hour
+
+        world, tracing = make_hour(*self._world, job)
+        return vars(getattr(paths, self._gather)(world, self._points, tracing, report=self.report))
+
+
 def each_hour(
-    hours: Sequence[float],
+    task: Bake,
+    geometry: Geometry,
+    gather: str,
+    points: Any,
+    shape: tuple[int, int],
+    place: Place,
     checkpoint: Checkpoint | None,
-    table: Mapping[str, Part],
-    make: Callable[[float, Callable[[float], None]], dict[str, np.ndarray]],
     progress: OnProgress | None,
 ) -> list[dict[str, np.ndarray]]:
-    """Computes the result of each hour, except those in the checkpoint.
-
-    `make(hour, report)` computes the arrays of an hour, which `table` describes, and calls `report` with the finished
-    share of the work; `progress` is called regularly.
-    """
-    meter, results = Meter(progress, "bake", _REPORTS * len(hours)), []
-    try:
-        for number, hour in enumerate(hours):
-            result = None if checkpoint is None else checkpoint.finished(number, table)
-            if result is None:
-
-                def report(share: float, number: int = number) -> None:
-                    done = int(_REPORTS * (number + share))
-                    if meter.due(done):
-                        meter.report(done)
-
-                result = make(hour, report)
-                if checkpoint is not None:
-                    checkpoint.add_finished(number, result)
-            meter.report(_REPORTS * (number + 1))
-            results.append(result)
-    except KeyboardInterrupt:
-        if checkpoint is not None:
-            # Hours that finish quickly aren't written individually.
-            checkpoint.flush()
-        raise
-    return results
+    """Bakes the hours of a scene, in ascending order, except those in the checkpoint; for `gather` and `points` see
+    `HourBaker`. `shape` is the number of points and of the numbers of each."""
+    if place.device != "cpu" and place.cluster is None and (place.workers or 1) > 1:
+        raise WlmError(f"workers: expected 1 on a GPU of this machine, as Mitsuba uses the first, got {place.workers}")
+    table = {
+        "mean": Part(np.float32, shape, least=0.0 if gather == "irradiance" else None),
+        "noise": Part(np.float32, shape, least=0.0),
+        "back": Part(np.float32, shape[:1], least=0.0, most=1.0),
+    }
+    # Workers need no part of the file but the surfaces.
+    bare = replace(geometry, document=replace(geometry.document, content={}, buffers=()), replacements=())
+    worker, hours = (HourBaker, gather, points, task.scene, bare, task.sky), sorted(task.scene.hours)
+    meter = Meter(progress, "bake", _REPORTS * len(hours))
+    tasks = [Task((i,), _REPORTS, partial(float, hour), table=table) for i, hour in enumerate(hours)]
+    results = gathered(worker, tasks, meter, place, checkpoint)
+    return [results[number] for number in range(len(hours))]

@@ -1,5 +1,6 @@
 """The commands for lightmaps of meshes: compress, evaluate, decode, export, info."""
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -24,20 +25,6 @@ _Lights = Annotated[
         ".json that lists them; default those that the glTF file names.",
     ),
 ]
-_Mask = Annotated[
-    Path | None,
-    typer.Option(metavar="PNG", help="PNG whose texels that aren't black count; default the texels in triangles."),
-]
-_UvSet = Annotated[
-    int | None,
-    typer.Option("--uv-set", min=0, help="Number of the lightmap's UVs TEXCOORD_n; default 1 if present, else 0."),
-]
-_Node = Annotated[str | None, typer.Option(help="Name of the node that has the lightmap; default the best fit.")]
-_Slot = Annotated[
-    str | None,
-    typer.Option(help="Without LIGHTMAPS: read them from this slot of the materials, occlusion or emissive."),
-]
-_Flip = Annotated[bool, typer.Option("--flip", help="The top row of the lightmap is at v = 1 instead of v = 0.")]
 _Views = Annotated[
     int | None,
     typer.Option(
@@ -56,73 +43,84 @@ _Resolution = Annotated[
 ]
 
 
+@dataclass(frozen=True)
+class LightOptions:
+    """Options that state how the lightmaps of a mesh are read."""
+
+    mask: Annotated[
+        Path | None,
+        typer.Option(metavar="PNG", help="PNG whose texels that aren't black count; default the texels in triangles."),
+    ] = None
+    uv_set: Annotated[
+        int | None,
+        typer.Option("--uv-set", min=0, help="Number of the lightmap's UVs TEXCOORD_n; default 1 if present, else 0."),
+    ] = None
+    node: Annotated[str | None, typer.Option(help="Name of the node that has the lightmap; default the best fit.")] = (
+        None
+    )
+    encoding: opt.Encoding = None
+    flip: Annotated[bool, typer.Option("--flip", help="The top row of the lightmap is at v = 1 instead of v = 0.")] = (
+        False
+    )
+    slot: Annotated[
+        str | None,
+        typer.Option(help="Without LIGHTMAPS: read them from this slot of the materials, occlusion or emissive."),
+    ] = None
+    trust: opt.Trust = False
+
+    def load(self, mesh: Path, lightmaps: Path | None, **changes: Any) -> "LightmappedScene":
+        """Reads a mesh and its lightmaps, with some of the options changed."""
+        from wlm.atlas import load
+
+        options = vars(self) | changes
+        return load(mesh, lightmaps, mask_path=options.pop("mask"), **options)
+
+
 @with_settings("wlm.atlas:Profile")
 @console.exclusive
+@opt.with_options
 def compress(
     mesh: _Mesh,
     output: Annotated[Path, opt.output_option("OUT.wlm", "The file to write.")],
     settings: dict[str, Any],
+    options: LightOptions,
+    work: opt.FitOptions,
     lightmaps: _Lights = None,
     profile: opt.Profile = "standard",
-    mask: _Mask = None,
-    uv_set: _UvSet = None,
-    node: _Node = None,
-    encoding: opt.Encoding = None,
-    flip: _Flip = False,
-    slot: _Slot = None,
-    seed: opt.Seed = 0,
-    device: opt.Device = "cpu",
-    resume: opt.Resume = False,
-    checkpoint_every: opt.CheckpointEvery = 30.0,
-    trust: opt.Trust = False,
 ) -> None:
     """Compress the lightmaps of a mesh or a scene, in one state or several, into one file together with the triangles.
 
     Finished stages are saved in OUT.wlm.partial from time to time and on Ctrl-C or SIGTERM; repeat the command with
     --resume to continue exactly.
     """
-
-    def load() -> "LightmappedScene":
-        from wlm.atlas import load
-
-        reading = {"uv_set": uv_set, "node": node, "encoding": encoding, "flip": flip, "slot": slot}
-        return load(mesh, lightmaps, mask_path=mask, **reading, trust=trust)
-
-    options = {"seed": seed, "device": device, "resume": resume, "every": checkpoint_every}
-    _, model, facts = models.fit("atlas", load, output, profile, settings, **options)
+    load = lambda: options.load(mesh, lightmaps)  # noqa: E731
+    _, model, facts = models.fit("atlas", load, output, profile, settings, work)
     console.show_facts(model.name, facts | _facts(model))
     console.note_warnings(model.report.get("lost light", ()))
 
 
+@opt.with_options
 def evaluate(
     file: opt.ModelFile,
     mesh: _Mesh,
+    options: LightOptions,
     lightmaps: _Lights = None,
     views: _Views = None,
     resolution: _Resolution = None,
     json_path: opt.ReportFile = None,
-    mask: _Mask = None,
-    uv_set: _UvSet = None,
-    node: _Node = None,
-    encoding: opt.Encoding = None,
-    flip: _Flip = False,
-    slot: _Slot = None,
     device: opt.Device = "cpu",
-    trust: opt.Trust = False,
 ) -> None:
     """Compare compressed lightmaps with the originals on rendered views of the scene."""
     if json_path is not None:
         console.check_output(json_path, ".json")
     console.quiet_warp()
-    from wlm.atlas import evaluate, load
+    from wlm.atlas import evaluate
     from wlm.interop import check_device
-    from wlm.system import load as load_model
+    from wlm.system import load
 
     device = check_device(device)
-    model = load_model(file, "atlas")
-    uv_set = model.stored.uv_set if uv_set is None else uv_set
-    reading = {"uv_set": uv_set, "node": node, "encoding": encoding, "flip": flip, "slot": slot}
-    scene = load(mesh, lightmaps, mask_path=mask, **reading, trust=trust)
+    model = load(file, "atlas")
+    scene = options.load(mesh, lightmaps, uv_set=model.stored.uv_set if options.uv_set is None else options.uv_set)
     with console.running("evaluate") as progress:
         report = evaluate(model, scene, views=views, resolution=resolution, device=device, progress=progress)
     if not report.views:

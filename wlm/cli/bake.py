@@ -1,12 +1,13 @@
 """`wlm bake`: makes lightmaps and probes of a scene by path tracing."""
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from wlm.cli.console import check_output, exclusive, note, note_start, quiet_warp, running, show, table
-from wlm.cli.options import Device, Resume, Trust, output_option
+from wlm.cli.options import PlaceOptions, Resume, Trust, output_option, with_options
 
 app = typer.Typer(help="Make inputs by path tracing: lightmaps and probes, by Mitsuba (extra `bake`).")
 
@@ -19,11 +20,12 @@ _Scene = Annotated[
 
 
 @app.command()
+@with_options
 @exclusive
 def lightmaps(
     scene: _Scene,
     output: Annotated[Path, output_option("DIR", "Folder to write the set to.")],
-    device: Device = "cpu",
+    place: PlaceOptions,
     resume: Resume = False,
     trust: Trust = False,
 ) -> None:
@@ -38,13 +40,13 @@ def lightmaps(
 
     claim(output, INDEX, FORMAT)
     task = open_task(scene, trust)
-    checkpoint = open_checkpoint(output, task, "lightmaps", device, resume=resume)
+    checkpoint = open_checkpoint(output, task, "lightmaps", place.device, resume=resume)
     note_start(checkpoint, resume, "from the beginning")
     with running("bake", checkpoint.path, "percent", whole=False) as progress:
-        baked = bake_lightmaps(task, device=device, checkpoint=checkpoint, progress=progress)
+        baked = bake_lightmaps(task, **asdict(place), checkpoint=checkpoint, progress=progress)
         files = write_lightmaps(output, task, baked)
         checkpoint.remove()
-    rows = table(str(output), ["hour", "mean", "largest", "relative noise"])
+    rows = table(str(output), ["hour", "mean irradiance", "largest", "relative noise"])
     for hour, light, error in zip(baked.hours, baked.light, baked.error, strict=True):
         seen = light[baked.mask].astype("float32")
         rows.add_row(f"{hour:g}", f"{seen.mean():.4g}", f"{seen.max():.4g}", f"{error:.2%}")
@@ -54,11 +56,12 @@ def lightmaps(
 
 
 @app.command()
+@with_options
 @exclusive
 def probes(
     scene: _Scene,
     output: Annotated[Path, output_option("OUT.npz", "The file to write.")],
-    device: Device = "cpu",
+    place: PlaceOptions,
     resume: Resume = False,
     trust: Trust = False,
 ) -> None:
@@ -72,13 +75,13 @@ def probes(
     from wlm.bake.work import open_checkpoint, open_task
 
     task = open_task(scene, trust)
-    checkpoint = open_checkpoint(output, task, "probes", device, resume=resume)
+    checkpoint = open_checkpoint(output, task, "probes", place.device, resume=resume)
     note_start(checkpoint, resume, "from the beginning")
     with running("bake", checkpoint.path, "percent", whole=False) as progress:
-        baked = bake_probes(task, device=device, checkpoint=checkpoint, progress=progress)
+        baked = bake_probes(task, **asdict(place), checkpoint=checkpoint, progress=progress)
         write_probes(output, baked)
         checkpoint.remove()
-    rows = table(str(output), ["hour", "probes", "lit probes", "mean L00", "relative noise"])
+    rows = table(str(output), ["hour", "probes", "lit probes", "mean ambient light", "relative noise"])
     for hour, values, error in zip(baked.hours, baked.values, baked.error, strict=True):
         lit = values.any(axis=(1, 2))
         mean = f"{values[lit, 0].mean():.4g}" if lit.any() else "–"

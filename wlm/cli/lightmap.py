@@ -1,6 +1,7 @@
 """The commands for lightmaps over time: compress, evaluate, decode, export, info."""
 
 import math
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -25,40 +26,6 @@ _Set = Annotated[
         help="A set.json, a folder of lightmaps (.exr, .hdr, .pfm, .tif, .ktx2, .dds), or folders of Unity bakes.",
     ),
 ]
-_Times = Annotated[
-    str | None,
-    typer.Option(
-        help="Times of the lightmaps in the order of set.json or of their names, such as 0,6.5,12 or 0:24:1 for "
-        "0,1,...,23; default as set.json or the names state."
-    ),
-]
-_Mask = Annotated[
-    str | None,
-    typer.Option(
-        help='Texels that belong to charts: a PNG (above 0), "alpha" (of the lightmaps, above 0) or "all"; default as '
-        "set.json states."
-    ),
-]
-_Period = Annotated[
-    float | None,
-    typer.Option(
-        help="Length of the day, in the unit of the times; default that of set.json, or 24 for hours in names."
-    ),
-]
-_Layers = Annotated[
-    str | None, typer.Option(metavar="NAMES", help="Layers of the set to read, separated by commas; default all.")
-]
-
-_Groups = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--group",
-        metavar="NAME=PATH",
-        help="A light group, which is added when the file is decoded: a set, or one lightmap for all times, such as "
-        "that of a lamp. May be repeated; SET is the group base unless it names groups.",
-    ),
-]
-
 # Columns of the scores of a sheet: heading, attribute, format, factor.
 _SCORES = (
     ("PSNR, dB", "psnr", ".2f", 1.0),
@@ -70,81 +37,98 @@ _SHOWN = (
     ("texels beside charts, dB", "ring", ".2f", 1.0),
     ("between stored times, dB", "between", ".2f", 1.0),
     ("error at tile borders relative to inside", "border", ".2f", 1.0),
-    ("flicker, %", "flicker", ".3f", 100.0),
+    ("flicker, % of the range", "flicker", ".3f", 100.0),
     ("views, dB", "view_psnr", ".2f", 1.0),
     ("views, FLIP", "view_flip", ".4f", 1.0),
 )
 
 
+@dataclass(frozen=True)
+class SetOptions:
+    """Options that state how lightmaps over time are read."""
+
+    times: Annotated[
+        str | None,
+        typer.Option(
+            help="Times of the lightmaps in the order of set.json or of their names, such as 0,6.5,12 or 0:24:1 for "
+            "0,1,...,23; default as set.json or the names state."
+        ),
+    ] = None
+    mask: Annotated[
+        str | None,
+        typer.Option(
+            help='Texels that belong to charts: a PNG (above 0), "alpha" (of the lightmaps, above 0) or "all"; default '
+            "as set.json states."
+        ),
+    ] = None
+    period: Annotated[
+        float | None,
+        typer.Option(
+            help="Length of the day, in the unit of the times; default that of set.json, or 24 for hours in names."
+        ),
+    ] = None
+    layers: Annotated[
+        str | None, typer.Option(metavar="NAMES", help="Layers of the set to read, separated by commas; default all.")
+    ] = None
+    encoding: opt.Encoding = None
+    groups: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--group",
+            metavar="NAME=PATH",
+            help="A light group, which is added when the file is decoded: a set, or one lightmap for all times, such "
+            "as that of a lamp. May be repeated; SET is the group base unless it names groups.",
+        ),
+    ] = None
+    trust: opt.Trust = False
+
+    def load(self, path: Path) -> "LightmapSet":
+        """Reads lightmaps."""
+        from wlm.lightmap import load
+        from wlm.lightmap.data import parse_times
+
+        options = vars(self) | {"groups": _by_group("--group", self.groups, "PATH")}
+        if self.times is not None:
+            options["times"] = parse_times(self.times)
+        if self.layers is not None:
+            options["layers"] = [name.strip() for name in self.layers.split(",")]
+        return load(path, **options)
+
+
 @with_settings("wlm.lightmap:Profile")
 @console.exclusive
+@opt.with_options
 def compress(
     set_path: _Set,
     output: Annotated[Path, opt.output_option("OUT.wlm", "The file to write.")],
     settings: dict[str, Any],
+    options: SetOptions,
+    work: opt.FitOptions,
     profile: opt.Profile = "M",
-    times: _Times = None,
-    mask: _Mask = None,
-    period: _Period = None,
-    layers: _Layers = None,
-    encoding: opt.Encoding = None,
-    groups: _Groups = None,
-    workers: Annotated[
-        int | None,
-        typer.Option(
-            min=1,
-            metavar="N",
-            help="Processes that fit tiles in parallel, with the same result; default one per two cores, one on a GPU.",
-        ),
-    ] = None,
-    cluster: Annotated[
-        str | None,
-        typer.Option(metavar="ADDRESS", help='Fit on a Ray cluster (extra `cluster`): ray://HOST:10001, or "auto".'),
-    ] = None,
-    seed: opt.Seed = 0,
-    device: opt.Device = "cpu",
-    resume: opt.Resume = False,
-    checkpoint_every: opt.CheckpointEvery = 30.0,
-    trust: opt.Trust = False,
 ) -> None:
     """Compress lightmaps over time into one file.
 
     The fit is saved in OUT.wlm.partial from time to time and on Ctrl-C or SIGTERM; repeat the command with --resume to
     continue exactly. Lightmaps of more than 1 GiB are kept in a temporary file (TMPDIR) during the fit.
     """
-    options = {"seed": seed, "device": device, "resume": resume, "every": checkpoint_every}
-    options |= {"workers": workers, "cluster": cluster}
-
-    _, model, facts = models.fit(
-        "lightmap",
-        lambda: _load(set_path, times, mask, period, layers, encoding, groups, trust),
-        output,
-        profile,
-        settings,
-        **options,
-    )
+    _, model, facts = models.fit("lightmap", lambda: options.load(set_path), output, profile, settings, work)
     console.show_facts(model.name, facts | _facts(model))
     _show_sheets(model)
     console.note_warnings(model.warnings)
 
 
+@opt.with_options
 def evaluate(
     file: opt.ModelFile,
     set_path: _Set,
+    options: SetOptions,
     json_path: opt.ReportFile = None,
     views: Annotated[int, typer.Option(min=0, help="Number of rendered views to score, if the set names a mesh.")] = 50,
-    times: _Times = None,
-    mask: _Mask = None,
-    period: _Period = None,
-    layers: _Layers = None,
-    encoding: opt.Encoding = None,
-    groups: _Groups = None,
     all_lights: Annotated[
         Path | None,
         typer.Option(metavar="SET", help="A bake of all lights together, to compare the sum of the light groups with."),
     ] = None,
     device: opt.Device = "cpu",
-    trust: opt.Trust = False,
 ) -> None:
     """Compare compressed lightmaps with the originals: PSNR, SSIM and FLIP by tile and time, and bits per texel.
 
@@ -160,13 +144,13 @@ def evaluate(
 
     device = check_device(device)
     model = load(file, "lightmap")
-    lightmaps = _load(set_path, times, mask, period, layers, encoding, groups, trust)
-    together = None if all_lights is None else _load(all_lights, None, mask, period, layers, encoding, None, trust)
+    lightmaps = options.load(set_path)
+    together = None if all_lights is None else replace(options, times=None, groups=None).load(all_lights)
     console.note_warnings((*lightmaps.warnings, *(together.warnings if together is not None else ())))
     with console.running("score") as progress:
         size = file.stat().st_size
-        options: dict[str, Any] = {"file_bytes": size, "all_lights": together}
-        report = evaluate(model, lightmaps, views=views, device=device, progress=progress, **options)
+        given: dict[str, Any] = {"file_bytes": size, "all_lights": together}
+        report = evaluate(model, lightmaps, views=views, device=device, progress=progress, **given)
     if json_path is not None:
         console.write_json(json_path, report.to_json())
     _show_report(file, report)
@@ -225,25 +209,6 @@ def info(file: opt.ModelFile, as_json: opt.AsJson = False, device: opt.Device = 
     model = models.describe(file, "lightmap", device, as_json, facts)
     if not as_json:
         _show_sheets(model)
-
-
-def _load(
-    path: Path,
-    times: str | None,
-    mask: str | None,
-    period: float | None,
-    layers: str | None,
-    encoding: str | None,
-    groups: list[str] | None,
-    trust: bool,
-) -> "LightmapSet":
-    from wlm.lightmap import load
-    from wlm.lightmap.data import parse_times
-
-    stamps = None if times is None else parse_times(times)
-    names = None if layers is None else [name.strip() for name in layers.split(",")]
-    options: dict[str, Any] = {"mask": mask, "period": period, "trust": trust, "encoding": encoding}
-    return load(path, times=stamps, layers=names, groups=_by_group("--group", groups, "PATH"), **options)
 
 
 def _by_group(option: str, given: list[str] | None, value: str) -> dict[str, str]:

@@ -17,11 +17,7 @@ def fit(
     output: Path,
     profile: str,
     settings: Mapping[str, Any],
-    *,
-    seed: int,
-    device: str,
-    resume: bool,
-    every: float,
+    work: opt.FitOptions,
     inputs: Mapping[str, Any] | None = None,
     **options: Any,
 ) -> tuple[Any, Any, dict[str, Any]]:
@@ -38,12 +34,13 @@ def fit(
     checked = package.Profile.load(profile).override(settings, "--")
     data = load()
     console.note_warnings(data.warnings)
-    shared = {"seed": seed, "device": device} | dict(inputs or {})
-    checkpoint = package.open_checkpoint(output, data, checked, resume=resume, every=every, **shared)
-    console.note_start(checkpoint, resume, "at step 0")
+    same = {"seed": work.seed, "device": work.device} | dict(inputs or {})
+    checkpoint = package.open_checkpoint(output, data, checked, resume=work.resume, every=work.checkpoint_every, **same)
+    console.note_start(checkpoint, work.resume, "at step 0")
     start = time.perf_counter()
     with console.running("fit", checkpoint.path) as progress:
-        model = package.compress(data, checked, progress=progress, checkpoint=checkpoint, **shared, **options)
+        options |= same | {"workers": work.workers, "cluster": work.cluster}
+        model = package.compress(data, checked, progress=progress, checkpoint=checkpoint, **options)
         seconds = time.perf_counter() - start
         size = model.save(output)
         checkpoint.remove()

@@ -1,5 +1,9 @@
 """Options that several commands share, each defined once."""
 
+import functools
+import inspect
+from collections.abc import Callable
+from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -90,3 +94,55 @@ Colours = Annotated[
 def output_option(metavar: str, help_text: str) -> Any:
     """Returns the typer option `--output` (`-o`) for the annotation of a path."""
     return typer.Option("--output", "-o", metavar=metavar, help=help_text)
+
+
+@dataclass(frozen=True)
+class PlaceOptions:
+    """Options that state where long work runs, see `wlm.dispatch.Place`."""
+
+    device: Device = "cpu"
+    workers: Annotated[
+        int | None,
+        typer.Option(
+            min=1, metavar="N", help="Processes that share the work; with --device cuda on all GPUs of this machine."
+        ),
+    ] = None
+    cluster: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ADDRESS", help='Share the work on a Ray cluster (extra `cluster`): ray://HOST:10001, or "auto".'
+        ),
+    ] = None
+
+
+@dataclass(frozen=True)
+class FitOptions(PlaceOptions):
+    """Options of a fit."""
+
+    seed: Seed = 0
+    resume: Resume = False
+    checkpoint_every: CheckpointEvery = 30.0
+
+
+def with_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Gives a command an option for each field of the dataclasses that are types of its parameters."""
+    signature = inspect.signature(command)
+    kinds = {name: each.annotation for name, each in signature.parameters.items() if is_dataclass(each.annotation)}
+
+    @functools.wraps(command)
+    def run(**values: Any) -> None:
+        made = {
+            name: kind(**{each.name: values.pop(each.name) for each in fields(kind)}) for name, kind in kinds.items()
+        }
+        command(**made, **values)
+
+    own = [parameter for name, parameter in signature.parameters.items() if name not in kinds]
+    shared = [
+        inspect.Parameter(field.name, inspect.Parameter.KEYWORD_ONLY, default=field.default, annotation=field.type)
+        for kind in kinds.values()
+        for field in fields(kind)
+    ]
+    # typer reads both.
+    run.__signature__ = signature.replace(parameters=[*own, *shared])  # type: ignore[attr-defined]
+    run.__annotations__ = {parameter.name: parameter.annotation for parameter in (*own, *shared)}
+    return run

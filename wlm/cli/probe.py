@@ -48,11 +48,13 @@ _At = Annotated[
 
 
 @with_settings("wlm.probe:Profile")
+@opt.with_options
 @console.exclusive
 def compress(
     probes: _Probes,
     output: Annotated[Path, opt.output_option("OUT.wlm", "The file to write.")],
     settings: dict[str, Any],
+    work: opt.FitOptions,
     profile: opt.Profile = "standard",
     positions: Annotated[
         bool, typer.Option("--positions", help="Also store the positions of the probes, 16 bits per axis.")
@@ -62,10 +64,6 @@ def compress(
     convention: _Convention = None,
     order: _Order = None,
     axes: _Axes = None,
-    seed: opt.Seed = 0,
-    device: opt.Device = "cpu",
-    resume: opt.Resume = False,
-    checkpoint_every: opt.CheckpointEvery = 30.0,
 ) -> None:
     """Compress light probes into one file: Gaussians and a small network, or principal components for small sets.
 
@@ -83,12 +81,11 @@ def compress(
     from wlm.probe.hours import listed_times
 
     inputs = {} if mesh is None else {"geometry": read_geometry(mesh, with_uv=False)}
-    options = {"seed": seed, "device": device, "resume": resume, "every": checkpoint_every, "positions": positions}
-    data, model, facts = models.fit("probe", load, output, profile, settings, inputs=inputs, **options)
+    data, model, facts = models.fit("probe", load, output, profile, settings, work, inputs, positions=positions)
     size = facts["bytes on disk"]
     facts |= {
-        "share of float32": f"{size / data.float_bytes:.2%}",
-        "bits per probe": f"{size * 8 / data.probes:.2f}",
+        "share of the probes as float32": f"{size / data.float_bytes:.2%}",
+        "bits per probe on disk": f"{size * 8 / data.probes:.2f}",
         "method": model.method,
         **({"hours": listed_times(model.times)} if len(model.times) else {}),
         **model.content.facts(),
@@ -248,7 +245,7 @@ def info(file: opt.ModelFile, as_json: opt.AsJson = False, device: opt.Device = 
 
 
 def _show_report(file: Path, model: "ProbeModel", report: "Report") -> None:
-    columns = ["PSNR, dB", "live probes, dB", "irradiance, dB", "bytes on disk", "share of float32", "bits per probe"]
+    columns = ["PSNR, dB", "lit probes, dB", "irradiance, dB", "bytes on disk", "of float32 size", "bits per probe"]
     rows = console.table(str(file), ["", *columns])
     psnr = (console.number(value, ".2f") for value in (report.psnr, report.psnr_live, report.irradiance_psnr))
     sizes = (f"{report.bytes:,}", f"{report.ratio:.2%}", f"{report.bits_per_probe:.2f}")
@@ -257,7 +254,7 @@ def _show_report(file: Path, model: "ProbeModel", report: "Report") -> None:
     if report.psnr_by_band is not None:
         rows.add_section()
         for band, value in enumerate(report.psnr_by_band):
-            rows.add_row(f"SH band {band}", console.number(value, ".2f"))
+            rows.add_row(f"spherical harmonics, band {band}", console.number(value, ".2f"))
     for hour in report.hours:
         figures = (console.number(hour[name], ".2f") for name in ("psnr", "psnr_live", "irradiance_psnr"))
         rows.add_row(f"at {hour['time']:g} h", *figures)

@@ -83,12 +83,12 @@ def _draw(scene: "Scene", output: Path, **options: Any) -> None:
         report = draw(scene, output, **options, progress=progress)
     if "frame_ms" in report:
         rows = [(name, *(each[key] for key in ("mean", "p95", "most"))) for name, each in report["frame_ms"].items()]
-        show_figures(f"{scene.title}: milliseconds of a frame", ["stage", "mean", "95%", "most"], rows)
-        pages = {"pages decoded in a frame": report["decoded"], "share of points at their page": report["current"]}
+        show_figures(f"{scene.title}: milliseconds of a frame", ["stage", "mean", "95% are below", "longest"], rows)
+        pages = {"pages decoded per frame": report["decoded"], "share of points at full detail": report["current"]}
         show_facts(report["film"]["file"], {"frames": report["film"]["frames"]} | pages)
     show_facts("bytes on the device", report["memory"])
     if report["views"]:
         rows = [(row["hour"], row["psnr"], row["flip"]) for row in report["views"]]
-        show_figures("views against the original lightmaps", ["hour", "PSNR", "FLIP"], rows)
+        show_figures("views against the original lightmaps", ["hour", "PSNR, dB", "FLIP"], rows)
     note_warnings(report["warnings"])
     note(f"written to {output}")

@@ -1,6 +1,5 @@
 """`wlm smoke`: simulates and lights smoke, and makes six-way lightmaps by ray marching or with a network."""
 
-from functools import partial
 from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -9,11 +8,12 @@ import typer
 from rich.markup import escape
 
 from wlm.cli import console, smoke_book, smoke_network
-from wlm.cli.options import CheckpointEvery, Device, Resume, Seed, output_option
+from wlm.cli.options import CheckpointEvery, Device, Resume, Seed, output_option, with_options
 from wlm.cli.smoke_network import evaluate, info
 from wlm.cli.smoke_options import (
     SHEET,
     Background,
+    FrameOptions,
     Input,
     Lights,
     SmokeOptions,
@@ -23,16 +23,12 @@ from wlm.cli.smoke_options import (
     outputs,
     parse_lights,
     vector,
-    with_smoke,
     write_lightmaps,
 )
 from wlm.errors import WlmError
 from wlm_kernels.smoke.settings import March
 
 if TYPE_CHECKING:
-    from wlm.fluid.volume import DensityVolume
-    from wlm.smoke.camera import Camera
-    from wlm.smoke.lightmaps import SixWay
     from wlm.smoke.scene import Scene
 
 __all__ = ["INSTEAD", "app", "evaluate", "info"]
@@ -118,7 +114,7 @@ def simulate(
         "steps per frame": round(1.0 / (scene.rate * solver.duration)),
     }
     if figures:
-        facts |= {"smoke in the last frame": figures["smoke"], "seconds per frame": figures["frame s"]}
+        facts |= {"smoke at the end, m³ of density 1": figures["smoke"], "seconds per frame": figures["frame s"]}
         if not most and not warnings:
             _note_no_smoke(scene)
     console.show_facts(f"{output}: {scene.name}", facts)
@@ -138,12 +134,12 @@ def _note_no_smoke(scene: "Scene") -> None:
 
 
 @app.command()
-@with_smoke
+@with_options
 @console.exclusive
 def bake(
     smoke: Input,
     output: _Lightmaps,
-    options: SmokeOptions,
+    options: FrameOptions,
     step: Annotated[float, typer.Option(min=0.01, max=1000.0, help="Longest step of the ray march in voxels.")] = 0.5,
     supersample: Annotated[int, typer.Option(min=1, max=16, help="N: a pixel is the mean of N x N rays.")] = 1,
     g: _G = 0.0,
@@ -157,7 +153,6 @@ def bake(
         float | None,
         typer.Option(min=0.0, max=1.0, help="With --fit sphere: add multiple scattering of this albedo; default none."),
     ] = None,
-    resume: Resume = False,
 ) -> None:
     """Make six-way lightmaps by fine ray marching, and estimate the error due to the step length.
 
@@ -169,32 +164,26 @@ def bake(
     if albedo is not None and fit == "axes":
         raise WlmError("--albedo needs --fit sphere: with --fit axes lightmaps have single scattering only")
     console.quiet_warp()
-    from wlm.smoke.march.six_way import bake
-
-    frames = options.open(smoke)
-    settings = {"step": step, "g": g, "supersample": supersample}
-    make, made = partial(bake, **settings), {"made": "bake"} | settings
+    settings: dict[str, Any] = {"step": step, "g": g, "supersample": supersample}
+    method, made = "bake", {"made": "bake"} | settings
     if fit == "sphere":
-        from wlm.smoke.transport.sphere import bake_sphere
-
-        make = partial(bake_sphere, march=March(step, jitter=0.0, g=g), albedo=albedo)
+        method, settings = fit, {"march": March(step, jitter=0.0, g=g), "albedo": albedo}
         made |= {"fit": fit, "albedo": albedo}
-    write_lightmaps(frames, options.view(frames), output, make, made, resume=resume, errors=fit == "axes")
+    write_lightmaps(options, smoke, output, (method, settings), made, errors=fit == "axes")
 
 
 @app.command()
-@with_smoke
+@with_options
 @console.exclusive
 def predict(
     smoke: Input,
     output: _Lightmaps,
-    options: SmokeOptions,
+    options: FrameOptions,
     network: Annotated[
         Path | None, typer.Option(metavar="FILE", help='File of wlm smoke train; default "fast", which ships with wlm.')
     ] = None,
     coarse: Annotated[bool, typer.Option("--coarse", help="Only use a coarse ray march, without a network.")] = False,
     seed: Seed = 0,
-    resume: Resume = False,
 ) -> None:
     """Predict six-way lightmaps with a network from a coarse march: like bake, in less time.
 
@@ -205,28 +194,17 @@ def predict(
         raise WlmError("--coarse: expected no --network, since --coarse uses no network")
     console.quiet_warp()
     from wlm.smoke.codec import open_network
-    from wlm.smoke.march.six_way import bake_coarse, coarse_march
-    from wlm.smoke.network.prediction import SmokePredictor
 
-    frames = options.open(smoke)
-    predictor = None
-    if coarse:
-        made: dict[str, Any] = {"made": "coarse", "seed": seed}
-
-        def make(volume: "DensityVolume", camera: "Camera") -> "SixWay":
-            return bake_coarse(volume, camera, coarse_march(volume, seed))
-    else:
-        model = open_network(network)
-        made = {"made": "network", "seed": seed, "of": dict(model.summary)}
-        predictor = SmokePredictor(model, frames.device)
-        make = partial(predictor, seed=seed)
-    write_lightmaps(frames, options.view(frames), output, make, made, resume=resume)
-    if predictor is not None and (line := predictor.note()):
-        console.note(line)
+    made: dict[str, Any] = {"made": "coarse", "seed": seed}
+    method: Any = "coarse"
+    if not coarse:
+        method = open_network(network)
+        made |= {"made": "network", "of": dict(method.summary)}
+    write_lightmaps(options, smoke, output, (method, {"seed": seed}), made)
 
 
 @app.command()
-@with_smoke
+@with_options
 @console.exclusive
 def light(
     smoke: Input,
@@ -286,7 +264,7 @@ def light(
     colour, highest = colour or (1.0, 1.0, 1.0), 1 if orders == "single" else HIGHEST
     file = outputs(smoke, frames.single, output, "light", ".png", ".exr")
     rows = console.table(
-        str(smoke), ["file", "mean", "largest", "clipped pixels", *(["noise"] * (samples is not None))]
+        str(smoke), ["file", "mean radiance", "largest", "pixels above white", *(["noise"] * (samples is not None))]
     )
     pictures, thickness = [], 0.0
     with console.running("light") as progress:

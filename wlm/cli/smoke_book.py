@@ -109,7 +109,7 @@ def shade(
     single, shots = _source(lightmaps, textures, cells, source_layout, straight, from_gain, device)
     plain = Looks(lights=[LightSettings(toward=(1, 1, 1))])
     file = outputs(lightmaps, single, output, "shade", ".png")
-    rows = table(str(lightmaps), ["file", "covered pixels", "mean", "largest", "clipped pixels"])
+    rows = table(str(lightmaps), ["file", "pixels with smoke", "mean radiance", "largest", "pixels above white"])
     pictures, most = [], 0.0
     with running("shade") as progress:
         for shot in shots(None, progress):

@@ -1,5 +1,6 @@
 """`wlm smoke train` and `export-onnx`, and `wlm evaluate` and `info` for networks."""
 
+from dataclasses import asdict
 from math import isnan
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -7,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from wlm.cli import console
-from wlm.cli.options import AsJson, CheckpointEvery, Device, ModelFile, ReportFile, Resume, Seed, output_option
+from wlm.cli import options as opt
 from wlm.cli.settings import Generated, with_settings
 
 if TYPE_CHECKING:
@@ -21,21 +22,20 @@ def register(app: typer.Typer) -> None:
 
 
 @with_settings("wlm.smoke:Profile")
+@opt.with_options
 @console.exclusive
 def train(
     profile: Annotated[str, typer.Argument(metavar="PROFILE", help="Settings: fast, paper, or a YAML file.")],
-    output: Annotated[Path, output_option("NETWORK", "The .safetensors to write.")],
+    output: Annotated[Path, opt.output_option("NETWORK", "The .safetensors to write.")],
     settings: dict[str, Any],
+    work: opt.FitOptions,
     minutes: Annotated[
         float | None, typer.Option(min=0.0, help="Minutes after which the training stops; --resume continues.")
     ] = None,
-    resume: Resume = False,
-    checkpoint_every: CheckpointEvery = 30.0,
-    seed: Seed = 0,
-    device: Device = "cpu",
 ) -> None:
     """Train a network on smoke simulated during the training, and keep the state with the best validation.
 
+    --workers and --cluster simulate sequences side by side; the network is trained in this process.
     The state is saved in NETWORK.partial from time to time and on Ctrl-C or SIGTERM; repeat the command with --resume
     to continue exactly. NETWORK.csv has the loss curves.
     """
@@ -47,12 +47,10 @@ def train(
 
     checked = Profile.load(profile).override(settings, "--")
     checkpoint = Path(f"{output}{SUFFIX}")
-    if resume and not checkpoint.exists() and not output.exists():
+    if work.resume and not checkpoint.exists() and not output.exists():
         console.note(f"{checkpoint}: there is nothing to resume; starting at step 0")
-    options = {"seed": seed, "device": device, "minutes": minutes, "resume": resume}
-    options["checkpoint_every"] = checkpoint_every
     with console.running("train", checkpoint) as progress:
-        training = fit(checked, output, progress=progress, **options)
+        training = fit(checked, output, progress=progress, minutes=minutes, **asdict(work))
     if not training.finished:
         console.note(
             f"out of time at step {training.steps}: repeat the command with --resume to continue from {checkpoint}"
@@ -72,7 +70,7 @@ def train(
 
 
 def export_onnx(
-    output: Annotated[Path, output_option("NETWORK.onnx", "The file to write.")],
+    output: Annotated[Path, opt.output_option("NETWORK.onnx", "The file to write.")],
     network: Annotated[
         Path | None,
         typer.Argument(metavar="NETWORK", help="Network that wlm smoke train wrote; default the shipped one."),
@@ -96,14 +94,14 @@ def export_onnx(
 
 
 def evaluate(
-    network: ModelFile,
+    network: opt.ModelFile,
     resolution: Annotated[int, typer.Option(min=8, max=4096, help="Edge of the test images in pixels.")] = 512,
     cells: Annotated[
         int | None,
         typer.Option(min=16, max=512, help="Air cells along an edge of the simulated box; default as trained."),
     ] = None,
-    json_path: ReportFile = None,
-    device: Device = "cpu",
+    json_path: opt.ReportFile = None,
+    device: opt.Device = "cpu",
 ) -> None:
     """Measure a network on simulated smoke that it was not trained on.
 
@@ -141,7 +139,7 @@ def evaluate(
     console.show_facts(str(network), facts | {f"PSNR of {name}, dB": value for name, value in planes})
 
 
-def info(file: ModelFile, as_json: AsJson = False) -> None:
+def info(file: opt.ModelFile, as_json: opt.AsJson = False) -> None:
     """Show the shape of a network and facts about its training."""
     console.quiet_warp()
     from wlm.formats.artifact import read_artifact

@@ -1,9 +1,8 @@
 """Options, output files and tables that the commands of `wlm smoke` have in common."""
 
-import functools
-import inspect
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -11,14 +10,11 @@ import typer
 from rich.markup import escape
 
 from wlm.cli.console import check_output, note, note_warnings, number, running, show, table
-from wlm.cli.options import Device, Trust
+from wlm.cli.options import Device, PlaceOptions, Resume, Trust
 from wlm.errors import WlmError
 
 if TYPE_CHECKING:
-    from wlm.fluid.volume import DensityVolume
-    from wlm.smoke.camera import Camera
     from wlm.smoke.data import Frames
-    from wlm.smoke.lightmaps import SixWay
     from wlm.smoke.scene import CameraSettings
     from wlm.smoke.shading import AnyLight, Light
 
@@ -45,7 +41,7 @@ Input = Annotated[
 
 @dataclass(frozen=True)
 class SmokeOptions:
-    """Options of a volume, its camera and the device, for the commands marked by `with_smoke`."""
+    """Options of a volume, its camera and the device, for `wlm.cli.options.with_options`."""
 
     resolution: Annotated[
         int | None, typer.Option(min=1, max=16384, help="Height of the image in pixels; default the scene's, or 512.")
@@ -70,8 +66,8 @@ class SmokeOptions:
     trust: Trust = False
     device: Device = "cpu"
 
-    def open(self, smoke: Path) -> "Frames":
-        """Opens a volume or a folder of frames."""
+    def open(self, smoke: Path, device: str | None = None) -> "Frames":
+        """Opens a volume or a folder of frames, whose volumes are read to a device; None: that of the options."""
         from wlm.fluid.grids import UPS
         from wlm.interop import check_device
         from wlm.smoke.data import load_frames
@@ -86,7 +82,7 @@ class SmokeOptions:
             raise WlmError(f"--volume kelvin: expected yes or no, got {settings['kelvin']!r}")
         if "kelvin" in settings:
             settings["kelvin"] = settings["kelvin"] == "yes"
-        frames = load_frames(smoke, **settings, trust=self.trust or None, device=check_device(self.device))
+        frames = load_frames(smoke, **settings, trust=self.trust or None, device=check_device(device or self.device))
         note_warnings(frames.warnings)
         return frames
 
@@ -107,24 +103,11 @@ class SmokeOptions:
         return settings
 
 
-def with_smoke(command: Callable[..., None]) -> Callable[..., None]:
-    """Gives a command the options of `SmokeOptions`, which it receives as its parameter `options`."""
-    signature = inspect.signature(command)
-    names = [field.name for field in fields(SmokeOptions)]
+@dataclass(frozen=True)
+class FrameOptions(SmokeOptions, PlaceOptions):
+    """Options of work on frames, which workers may share."""
 
-    @functools.wraps(command)
-    def run(**values: Any) -> None:
-        command(options=SmokeOptions(**{name: values.pop(name) for name in names}), **values)
-
-    own = [parameter for name, parameter in signature.parameters.items() if name != "options"]
-    shared = [
-        inspect.Parameter(field.name, inspect.Parameter.KEYWORD_ONLY, default=field.default, annotation=field.type)
-        for field in fields(SmokeOptions)
-    ]
-    # typer reads both.
-    run.__signature__ = signature.replace(parameters=[*own, *shared])  # type: ignore[attr-defined]
-    run.__annotations__ = {parameter.name: parameter.annotation for parameter in (*own, *shared)}
-    return run
+    resume: Resume = False
 
 
 def _pairs(option: str, texts: Sequence[str] | None, names: Sequence[str]) -> dict[str, Any]:
@@ -212,71 +195,84 @@ def _check_folder(smoke: Path, output: Path) -> None:
 
 
 def write_lightmaps(
-    frames: "Frames",
-    camera: "CameraSettings",
+    options: FrameOptions,
+    smoke: Path,
     output: Path,
-    make: "Callable[[DensityVolume, Camera], SixWay]",
+    arguments: tuple[Any, Mapping[str, Any]],
     settings: Mapping[str, Any],
-    *,
-    resume: bool,
     errors: bool = False,
 ) -> None:
     """Makes and writes the lightmaps of each frame, and shows a table.
 
     Args:
-        frames: The smoke.
-        camera: The camera of all frames.
+        options: The options of the command. With `resume` the frames are kept that an interrupted run of the same
+            settings has made.
+        smoke: A volume or a folder of frames.
         output: A file, or for frames a folder.
-        make: Makes the lightmaps of a volume.
+        arguments: Method and settings of `wlm.smoke.frames.FrameMaker`.
         settings: JSON values that the results depend on, besides smoke and camera. An "albedo" other than None means
             that the lightmaps already include it.
-        resume: Whether to keep the frames that an interrupted run of the same settings has made.
         errors: Whether the lightmaps state the error due to the step length.
     """
+    from wlm.dispatch import Place, Task, run
     from wlm.smoke.data import NumberedFiles, write_six_way
+    from wlm.smoke.frames import FrameMaker
     from wlm.smoke.lightmaps import axis_faults
-    from wlm.smoke.march.six_way import with_surface
+    from wlm.system import Meter
 
-    files = None
+    where, resume = Place(options.device, options.workers, options.cluster), options.resume
+    # What is sent to other processes is in the host's memory.
+    frames = options.open(smoke, where.here if len(where.devices()) == 1 else "cpu")
+    camera, files = options.view(frames), None
     if frames.single:
         if resume:
             raise WlmError(f"--resume: expected a folder of frames, but {frames.path} is one volume")
         check_output(output, ".exr")
     else:
         _check_folder(frames.path, output)
-        smoke = {"extinction": frames.extinction, "emission": frames.emission, "device": frames.device[:4]}
+        factors = {"extinction": frames.extinction, "emission": frames.emission, "device": where.device[:4]}
         scene = dict(frames.options) if frames.scene is None else frames.scene.model_dump(mode="json")
-        run = {**settings, **smoke, "scene": scene, "camera": camera.model_dump(mode="json")}
-        files = NumberedFiles(output, "six", ".exr", SHEET, run=run, resume=resume)
+        key = {**settings, **factors, "scene": scene, "camera": camera.model_dump(mode="json")}
+        files = NumberedFiles(output, "six", ".exr", SHEET, run=key, resume=resume)
         if resume:
             done = len(files.done)
             note(f"{output}: {done} frames are finished" if done else f"{files.partial}: there is nothing to resume")
-    columns = ["file", "covered pixels", "mean light", *(["largest error", "RMS error"] * errors)]
+    columns = ["file", "pixels with smoke", "their mean light", *(["largest error of light", "RMS error"] * errors)]
     rows = table(str(frames.path), columns)
-    numbers, thickness = [each for each in frames.numbers if files is None or each not in files.done], 0.0
+    numbers = [each for each in frames.numbers if files is None or each not in files.done]
+    made: dict[int, tuple[Any, ...]] = {}
+    thickness = [0.0]
+
+    def job(frame: int) -> tuple[Any, ...]:
+        volume, looks = frames.load(frame), frames.looks(frame)
+        note_warnings(volume.warnings)
+        thickness[0] = max(thickness[0], volume.thickness)
+        if looks is not None and settings.get("albedo") is not None:
+            looks = looks.model_copy(update={"albedo": (1.0, 1.0, 1.0)})
+        return str(frames.file(frame)), volume, frames.view(camera, volume), looks
+
+    tasks = [Task((frame,), 1, partial(job, frame)) for frame in numbers]
     with running("six", None if files is None else files.partial, "frame", whole=False) as progress:
-        for frame, volume in frames.volumes(numbers, progress):
-            note_warnings(volume.warnings)
-            thickness = max(thickness, volume.thickness)
-            looks = frames.looks(frame)
-            if looks is not None and settings.get("albedo") is not None:
-                looks = looks.model_copy(update={"albedo": (1.0, 1.0, 1.0)})
-            six = with_surface(make(volume, frames.view(camera, volume)), volume, looks)
+        meter = Meter(progress, "frames", len(tasks), every=0.0)
+        for task, (six, looks, said) in run((FrameMaker, *arguments), tasks, meter, where):
+            (frame,) = task.numbers
             path = output if files is None else files.file(frame)
             for fault in axis_faults(six.lightmaps):
                 note(f"{path}: {fault}")
             write_six_way(path, six, looks)
             covered = six.transparency < 0.99
-            rows.add_row(
-                escape(path.name),
-                f"{float(covered.float().mean()):.1%}",
-                number(float(six.lightmaps[:, covered].mean()) if covered.any() else None, ".4g"),
-                *((f"{six.error.largest:.2g}", f"{six.error.rms:.2g}") if errors else ()),
-            )
+            mean = float(six.lightmaps[:, covered].mean()) if covered.any() else None
+            row = [escape(path.name), f"{float(covered.float().mean()):.1%}", number(mean, ".4g")]
+            made[frame] = said, *row, *((f"{six.error.largest:.2g}", f"{six.error.rms:.2g}") if errors else ())
+    ordered = [made[frame] for frame in sorted(made)]
+    for _, *cells in ordered:
+        rows.add_row(*cells)
     if files is not None:
         files.finish()
     show(rows)
-    note_thickness(frames, thickness)
+    note_thickness(frames, thickness[0])
+    if ordered and ordered[-1][0]:
+        note(ordered[-1][0])
 
 
 def note_thickness(frames: "Frames", thickness: float) -> None:

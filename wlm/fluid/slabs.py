@@ -80,7 +80,13 @@ class Slabs:
 
     def each(self, compute: Callable[[Slab], None]) -> None:
         """Calls a function for each slab, which queues work on its device; this work begins after all earlier work, and
-        later work of the first device begins after it."""
+        later work of the first device begins after it.
+
+        Raises:
+            ValueError: There are several GPUs, and a CUDA graph is captured.
+        """
+        if self._others and self.home.is_capturing:
+            raise ValueError(f"device: expected one GPU during the capture of a CUDA graph, got {self.name}")
         for device in self._others:
             device.stream.wait_stream(self.home.stream)
         for slab in self.parts:

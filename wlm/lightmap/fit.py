@@ -1,15 +1,14 @@
 """Fits a compressed model to a lightmap set (neural-dynamic-gi, sections 3.4 and 4)."""
 
-import functools
 import os
 from collections.abc import Sequence
-from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from wlm.dispatch import CPU_LANES, Dispatch, Task, start_workers, worker_devices
+from wlm.dispatch import CPU_LANES, Place, Task, gathered
 from wlm.errors import WlmError
 from wlm.formats.checkpoint import EVERY, Checkpoint
 from wlm.formats.parts import Part
@@ -33,6 +32,7 @@ CPU_TILES = 4
 
 _LOOK = 32  # tiles that are classified between two looks at the clock: some seconds
 _WORTHWHILE = 20_000_000  # samples that take two cores about 20 s: a process takes 3 s to start
+_FITTED = ("net", "uv", "uvt", "ut", "vt")  # arrays that a trainer returns
 _CONSTANT_ERROR = 0.01  # largest relative error of half floats of constant radiance; near 6e-8 they are further off
 
 Parts = dict[str, np.ndarray]
@@ -40,16 +40,11 @@ Parts = dict[str, np.ndarray]
 
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """Tiles of one sheet (three channels) and of one kind, STATIC or DYNAMIC, which are fitted together.
-
-    `rows`, int [n], are indices of the tiles in `SheetFit.index`; `first` is the number of tiles of the same kind in
-    earlier batches of the sheet. Batches are numbered from 0.
-    """
+    """Dynamic tiles of one sheet (three channels), which are fitted together; `rows` are theirs in the arrays of the
+    sheet's model. Batches are numbered from 0."""
 
     number: int
-    kind: TileKind
-    rows: np.ndarray
-    first: int
+    rows: range
     fit: "SheetFit"
 
 
@@ -74,12 +69,9 @@ def compress(
         tiles: Numbers of the tiles to compress, only for a set with one sheet; None: all. Other tiles are stored as
             empty.
         seed: One seed gives one result on one device.
-        device: "cpu", "cuda" or "cuda:N". Several workers on "cuda" are spread over the GPUs.
-        workers: Processes that fit batches of tiles side by side; the result does not depend on it. 1: only this
-            process. None: on the CPU one for every two cores, since a batch keeps two busy, but fewer for short fits; 1
-            on a GPU; on a cluster as many as it has room for.
-        cluster: Address of a Ray cluster whose machines fit the tiles, as `ray.init` takes it ("auto",
-            "ray://host:10001"); each worker takes two CPUs, or a GPU if the device is "cuda". None: this machine.
+        device: "cpu", "cuda" or "cuda:N".
+        workers, cluster: Where batches of tiles are fitted side by side, with the same result: see
+            `wlm.dispatch.Place`. On a CPU there is usually one worker for two cores, fewer for short fits.
         progress: Called about twice a second; in the stage "fit" with the loss and "PSNR dB" of the latest samples,
             relative to each tile's range. The stages "tiles" and "frames" may come before it.
         checkpoint: From `open_checkpoint`: keeps a running fit, and resumes an interrupted one.
@@ -94,7 +86,8 @@ def compress(
             diverged; workers died again and again; or the settings ask for frames without a BC7 encoder.
         KeyboardInterrupt: Raised by `progress`, after the checkpoint, if there is one, has been written.
     """
-    worker_devices(device, workers, cluster)  # an error before the set is classified
+    place = Place(device, workers, cluster)
+    here = place.here  # an error before the set is classified
     profile = Profile.load(profile).override(settings)
     if device != "cpu" and profile.hidden not in WIDTHS:
         raise WlmError(f"hidden: expected {', '.join(map(str, WIDTHS))} on a GPU, got {profile.hidden}")
@@ -104,29 +97,17 @@ def compress(
     batches: list[Batch] = []
     for fit in fits.values():
         batches += fit.batches(len(batches), CPU_TILES if device == "cpu" else None)
-    waiting = [batch for batch in batches if not batch.fit.restore(batch, checkpoint)]
     sheets = {sheet: fit.model for sheet, fit in fits.items()}
-    if waiting:
-        meter = Meter(progress, "fit", profile.steps * len(batches))
-        samples = profile.steps * profile.samples * sum(len(batch.rows) for batch in waiting)
-        usual = max(1, min(cores() // CPU_LANES, samples // _WORTHWHILE))
-        arguments = (seed, progress is not None)
-        pool = start_workers(Fitter, arguments, device, workers, cluster, len(waiting), usual)
-        tasks = [
-            Task((batch.number,), profile.steps, functools.partial(batch.fit.job, batch), batch.kind)
-            for batch in waiting
-        ]
-        try:
-            with closing(pool):
-                done = profile.steps * (len(batches) - len(waiting))
-                for number, parts in Dispatch(pool, tasks, meter, done, checkpoint).run():
-                    batches[number].fit.store(batches[number], parts)
-                    if checkpoint is not None:
-                        checkpoint.add_finished(number, parts)
-        except (WlmError, KeyboardInterrupt):
-            if checkpoint is not None:
-                checkpoint.flush()
-            raise
+    if place == Place():
+        samples = profile.steps * profile.samples * sum(len(batch.rows) for batch in batches)
+        place = Place(workers=max(1, min(cores() // CPU_LANES, samples // _WORTHWHILE)))
+    tasks = [
+        Task((each.number,), profile.steps, partial(each.fit.job, each), "tiles", each.fit.table(each))
+        for each in batches
+    ]
+    meter, worker = Meter(progress, "fit", profile.steps * len(batches)), (Fitter, seed, progress is not None)
+    for number, parts in gathered(worker, tasks, meter, place, checkpoint).items():
+        batches[number].fit.store(batches[number], parts, checkpoint)
     # Sheets of an atlas and a size share one mask.
     masks = {(sheet.atlas, own.mask.shape): own.mask for sheet, own in reversed(sheets.items())}
     for sheet, own in sheets.items():
@@ -136,8 +117,7 @@ def compress(
     # Groups with other numbers of times have maps of other sizes.
     stored = profile.for_times(*counts) if len(counts) == 1 else profile
     model = LightmapModel(lightmaps.name, lightmaps.source, stored, sheets, warnings)
-    # The device of a cluster is not on this machine.
-    model.warnings += tuple(lost_light(model, lightmaps, "cpu" if cluster is not None else device))
+    model.warnings += tuple(lost_light(model, lightmaps, here))
     return model
 
 
@@ -186,9 +166,9 @@ class _Facts:
     """Numbers of one tile that the file stores beside its maps and network, rounded as in the file (section 4)."""
 
     kind: TileKind
-    scale: np.ndarray | None = None  # [T, 3] of tiles with maps: codes, of a static tile half floats
-    peak: np.ndarray | None = None  # uint8 [T] of tiles with maps, codes of the largest colour
-    affine: np.ndarray | None = None  # [2, 3] of tiles with maps, shift and spread
+    scale: np.ndarray | None = None  # uint8 [T, 3] of a dynamic tile, codes of the channel means
+    peak: np.ndarray | None = None  # uint8 [T] of a dynamic tile, codes of the largest colour
+    affine: np.ndarray | None = None  # [2, 3] of a dynamic tile, shift and spread
     constant: np.ndarray | None = None  # float64 [T, 3], radiance of a constant tile
 
 
@@ -214,7 +194,7 @@ class SheetFit:
         self.index = np.arange(grid.count) if tiles is None else np.array(sorted(tiles), np.int64)
         check_index(self.index, grid)
         meter = Meter(progress, "tiles", len(self.index))
-        facts = _classify(lightmaps, self.index, meter, profile.gamma, profile.peak, profile.static_budget_db)
+        facts = _classify(lightmaps, self.index, meter, profile.gamma, profile.peak)
         self.kinds = np.array([tile.kind for tile in facts])
         framed = choose_frames(self.kinds, times, profile)
         self.warning = None
@@ -239,13 +219,10 @@ class SheetFit:
             constant=half if (np.abs(half - values) <= _CONSTANT_ERROR * values).all() else values.astype(np.float32),
             **arrays,
         )
-        self._mapped = np.flatnonzero(np.isin(self.kinds, (TileKind.STATIC, TileKind.DYNAMIC)))
-        for name, kind in (("scale", TileKind.DYNAMIC), ("scale_static", TileKind.STATIC)):
-            stored = [facts[row].scale for row in np.flatnonzero(self.kinds == kind)]
-            if stored:
-                getattr(self.model, name)[:] = stored
-        for i, row in enumerate(self._mapped):
-            self.model.peak[i], self.model.affine[i] = facts[row].peak, facts[row].affine
+        self._dynamic = np.flatnonzero(self.kinds == TileKind.DYNAMIC)
+        for i, row in enumerate(self._dynamic):
+            fact = facts[row]
+            self.model.scale[i], self.model.peak[i], self.model.affine[i] = fact.scale, fact.peak, fact.affine
         # The axis and the scales of a sheet do not change during a fit.
         self._axis, self._scale = self.model.axis, self.model.scales
         framed_rows = np.flatnonzero(self.kinds == TileKind.FRAMES)
@@ -260,64 +237,44 @@ class SheetFit:
         """Splits the tiles into batches of 1 to `most` tiles, about `BATCH_TEXELS` each, numbered from `first`."""
         size = max(1, BATCH_TEXELS // (len(self.model.times) * TILE * TILE))
         size = size if most is None else min(size, most)
-        result: list[Batch] = []
-        for kind in (TileKind.DYNAMIC, TileKind.STATIC):
-            rows = np.flatnonzero(self.kinds == kind)
-            for start in range(0, len(rows), size):
-                number, chosen = first + len(result), rows[start : start + size]
-                result.append(Batch(number, kind, chosen, start, self))
-        return result
+        rows = range(len(self._dynamic))
+        starts = enumerate(rows[::size], first)
+        return [Batch(number, rows[start : start + size], self) for number, start in starts]
 
     def job(self, batch: Batch) -> TileJob:
         """Returns the data of a batch that is sent to a worker."""
-        slots = np.searchsorted(self._mapped, batch.rows)
         return TileJob(
-            cut(self._lightmaps, self.index[batch.rows]),
-            batch.kind == TileKind.DYNAMIC,
-            self._scale[slots],
-            self.model.affine[slots].astype(np.float32),
+            cut(self._lightmaps, self.index[self._dynamic[batch.rows]]),
+            self._scale[batch.rows],
+            self.model.affine[batch.rows].astype(np.float32),
             self.model.profile,
             self._axis,
         )
 
     def table(self, batch: Batch) -> dict[str, Part]:
         """Returns the types and shapes of the arrays that the trainer returns for a finished batch, by name."""
-        kind = np.full(len(batch.rows), batch.kind, np.uint8)
+        kind = np.full(len(batch.rows), TileKind.DYNAMIC, np.uint8)
         table = part_table(self.model.profile, kind, len(self.model.times))
-        if batch.kind == TileKind.STATIC:
-            return {"net": table["net_static"], "uv": table["uv"]}
-        return {name: table[name] for name in ("net", "uv", "uvt", "ut", "vt")}
+        return {name: table[name] for name in _FITTED}
 
-    def store(self, batch: Batch, parts: Parts) -> None:
-        """Copies the maps and networks of a finished batch into the model."""
-        dynamic, model = batch.kind == TileKind.DYNAMIC, self.model
-        model.uv[np.searchsorted(self._mapped, batch.rows)] = parts["uv"]
-        arrays = ("uvt", "ut", "vt", "net") if dynamic else ("net",)
-        for name in arrays:
-            stored = getattr(model, name if dynamic else "net_static")
-            stored[batch.first : batch.first + len(batch.rows)] = parts[name]
-
-    def restore(self, batch: Batch, checkpoint: Checkpoint | None) -> bool:
-        """Copies a batch that a checkpoint holds as finished into the model; returns False if it does not hold it."""
-        parts = None if checkpoint is None else checkpoint.finished(batch.number, self.table(batch))
-        if parts is None:
-            return False
+    def store(self, batch: Batch, parts: Parts, checkpoint: Checkpoint | None = None) -> None:
+        """Copies the maps and networks of a finished batch, which may come from a checkpoint, into the model."""
         try:
-            check_packable(parts, self.model.profile, batch.kind == TileKind.DYNAMIC)
+            check_packable(parts, self.model.profile)
         except WlmError as error:
-            raise WlmError(f"{checkpoint.path}: finished batch {batch.number}: {error}") from error
-        self.store(batch, parts)
-        return True
+            raise WlmError(f"{checkpoint and checkpoint.path}: finished batch {batch.number}: {error}") from error
+        for name in _FITTED:
+            getattr(self.model, name)[batch.rows] = parts[name]
 
 
 def _classify(
-    lightmaps: SheetFrames, numbers: np.ndarray, meter: Meter, gamma: float, peak: float | None, budget_db: float
+    lightmaps: SheetFrames, numbers: np.ndarray, meter: Meter, gamma: float, peak: float | None
 ) -> list[_Facts]:
     """Classifies tiles and computes the numbers that normalise each (section 4); for the settings see `Profile`."""
 
     def look(number: int) -> _Facts:
         tile = cut(lightmaps, np.array([number])).encoded(gamma, padded=False)
-        kind = TileKind(int(classify(tile, gamma, budget_db, peak)[0]))
+        kind = TileKind(int(classify(tile, gamma, peak)[0]))
         if kind == TileKind.EMPTY:
             return _Facts(kind)
         colour = tile.colour[0][:, tile.mask[0]]  # [T, K, 3], the valid texels
@@ -326,13 +283,8 @@ def _classify(
             # The middle of the range is at most half a step of half float off.
             middle = 0.5 * (radiance.min(1) + radiance.max(1)) if peak is None else radiance.mean(1)
             return _Facts(kind, constant=middle)
-        means = channel_means(tile.colour, tile.mask)[0]
-        if kind == TileKind.DYNAMIC:
-            stored = encode_scale(means, gamma)
-            scale = decode_scale(stored, gamma)
-        else:
-            stored = means.astype(np.float16)
-            scale = stored.astype(np.float32)
+        stored = encode_scale(channel_means(tile.colour, tile.mask)[0], gamma)
+        scale = decode_scale(stored, gamma)
         lit = scale > 0
         values = colour * np.divide(1.0, scale, out=np.zeros_like(scale), where=lit)[:, None]
         affine = np.empty((2, 3))

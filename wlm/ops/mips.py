@@ -11,6 +11,8 @@ from wlm_kernels.raster import mips as kernels
 
 # Steps per pixel beyond this read the last level; their squares stay finite.
 _MOST = 1e12
+# A GPU sums the gradients of textures with few numbers in 32 copies: additions to one number wait for one another.
+_COPIES, _FEW_NUMBERS = 32, 2**15
 
 
 def read(
@@ -19,11 +21,11 @@ def read(
     """Reads B textures [B, H, W, C] at uv [B N, 2], N points each; see `wlm.ops.texture`. Returns [B N, C]."""
     _, height, width, channels = images.shape
     if derivatives is None:
-        levels, level = 1, uv.new_zeros(len(uv))
+        levels, level = 1, None
     else:
         levels, level = max(height, width).bit_length(), level_of(derivatives, height, width).reshape(-1)
     stacks = torch.cat([pad(each, (0, 0, 0, width - each.shape[2])) for each in pyramid(images, levels)], 1)
-    return _Read.apply(stacks.reshape(-1, width, channels), (height, width), levels, uv, level, filter, boundary)
+    return Read.apply(stacks.reshape(-1, width, channels), (height, width), levels, uv, level, filter, boundary)
 
 
 def pyramid(images: torch.Tensor, levels: int) -> list[torch.Tensor]:
@@ -48,38 +50,38 @@ def level_of(derivatives: torch.Tensor, height: int, width: int) -> torch.Tensor
     return 0.5 * torch.where(longest > 1.0, longest, torch.where(longest.isnan(), longest, 1.0)).log2()
 
 
-class _Read(torch.autograd.Function):
+class Read(torch.autograd.Function):
+    """Reads of textures with their gradients: `mips.sample` of the kernels."""
+
     @staticmethod
     def forward(ctx, stacks, size, levels, uv, level, filter, boundary):
-        stacks, uv, level = dense(stacks), dense(uv), dense(level)
+        stacks, uv, level = dense(stacks), dense(uv), None if level is None else dense(level)
         out = stacks.new_empty(len(uv), stacks.shape[2])
-        ctx.mode = {"filter": filter, "boundary": boundary}
+        ctx.mode = {"size": size, "levels": levels, "filter": filter, "boundary": boundary}
         with on_stream(stacks.device):
-            arrays = to_warp(uv, wp.vec2), to_warp(level), to_warp(out)
-            kernels.sample(to_warp(stacks), size, levels, *arrays, **ctx.mode)
+            at = None if level is None else to_warp(level)
+            kernels.sample(to_warp(stacks), to_warp(uv, wp.vec2), to_warp(out), level=at, **ctx.mode)
         ctx.save_for_backward(stacks, uv, level)
-        ctx.size, ctx.levels = size, levels
         return out
 
     @staticmethod
     @once_differentiable
     def backward(ctx, grad_out):
         stacks, uv, level = ctx.saved_tensors
-        on_stacks = zeros_for(stacks, ctx.needs_input_grad[0])
+        copies = _COPIES if stacks.is_cuda and len(uv) > stacks.numel() and stacks.numel() <= _FEW_NUMBERS else 1
+        on_stacks = zeros_for(stacks.expand(copies, *stacks.shape).movedim(0, -1), ctx.needs_input_grad[0])
         on_uv = torch.empty_like(uv) if ctx.needs_input_grad[3] else None
         on_level = torch.empty_like(level) if ctx.needs_input_grad[4] else None
         device = stacks.device
         with on_stream(device):
             kernels.sample_backward(
                 to_warp(stacks),
-                ctx.size,
-                ctx.levels,
                 to_warp(uv, wp.vec2),
-                to_warp(level),
                 to_warp(dense(grad_out)),
-                optional_array(on_stacks, 3, wp.float32, device),
+                optional_array(None if on_stacks is None else on_stacks.flatten(2), 3, wp.float32, device),
                 optional_array(on_uv, 1, wp.vec2, device),
                 optional_array(on_level, 1, wp.float32, device),
+                level=None if level is None else to_warp(level),
                 **ctx.mode,
             )
-        return on_stacks, None, None, on_uv, on_level, None, None
+        return None if on_stacks is None else on_stacks.sum(-1), None, None, on_uv, on_level, None, None

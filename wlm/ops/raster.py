@@ -19,7 +19,7 @@ from wlm.ops.tapes import NoGradientError, takes_arrays
 from wlm.ops.tensors import check, check_index, dense, on_stream, optional_array, zeros_for
 from wlm_kernels.raster import gradient as raster_gradient
 from wlm_kernels.raster import rasterize as kernels
-from wlm_kernels.raster import texture as texture_kernels
+from wlm_kernels.raster.texture import codes
 
 
 @dataclass(frozen=True)
@@ -195,7 +195,7 @@ def texture(
         ValueError: No such filter or boundary, a tensor's shape, type or device doesn't fit, `uv` requires a gradient
             with the filter "nearest", or that filter has derivatives.
     """
-    texture_kernels.codes(filter, boundary)
+    codes(filter, boundary)
     batched = getattr(image, "ndim", 3) == 4
     check("image", image, (None,) * (4 if batched else 3))
     if 0 in image.shape:
@@ -215,7 +215,7 @@ def texture(
         images = image if batched else image[None]
         texels = mips.read(images, points, derivatives, filter, boundary)
     else:
-        texels = _Texture.apply(image, points, filter, boundary)
+        texels = mips.Read.apply(image, None, 1, points, None, filter, boundary)
     return texels.reshape(*uv.shape[:-1], image.shape[-1])
 
 
@@ -306,36 +306,6 @@ class _Interpolate(torch.autograd.Function):
                 optional_array(on_barycentric, 2, wp.vec2, attribute.device),
             )
         return on_attribute, None, None, on_barycentric
-
-
-class _Texture(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, image, uv, filter, boundary):
-        uv = dense(uv)
-        out = image.new_empty(len(uv), image.shape[2])
-        with on_stream(image.device):
-            arrays = to_warp(image), to_warp(uv, wp.vec2), to_warp(out)
-            texture_kernels.sample(*arrays, filter=filter, boundary=boundary)
-        ctx.save_for_backward(image, uv)
-        ctx.mode = {"filter": filter, "boundary": boundary}
-        return out
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, grad_out):
-        image, uv = ctx.saved_tensors
-        on_image = zeros_for(image, ctx.needs_input_grad[0])
-        on_uv = torch.empty_like(uv) if ctx.needs_input_grad[1] else None
-        with on_stream(image.device):
-            texture_kernels.sample_backward(
-                to_warp(image),
-                to_warp(uv, wp.vec2),
-                to_warp(dense(grad_out)),
-                optional_array(on_image, 3, wp.float32, image.device),
-                optional_array(on_uv, 1, wp.vec2, image.device),
-                **ctx.mode,
-            )
-        return on_image, on_uv, None, None
 
 
 def _checked_triangles(triangle: torch.Tensor, count: int, device: torch.device) -> torch.Tensor:

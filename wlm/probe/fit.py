@@ -6,22 +6,20 @@ import os
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from wlm import interop
+from wlm.dispatch import Place, Task, run
 from wlm.errors import WlmError
 from wlm.formats.checkpoint import EVERY, Checkpoint
 from wlm.formats.geometry import Geometry
 from wlm.formats.parts import Part
-from wlm.metrics import psnr_from_mse
 from wlm.probe.codec import pack
 from wlm.probe.data import ProbeSet
-from wlm.probe.gaussian.model import check_outputs, gaussian_count
-from wlm.probe.gaussian.packing import pack_model
+from wlm.probe.gaussian.fitter import Fitter, Region
+from wlm.probe.gaussian.model import gaussian_count
 from wlm.probe.gaussian.pictures import Pixels, seen_pixels
-from wlm.probe.gaussian.trainer import Trainer
 from wlm.probe.model import CODES, ProbeModel, Profile, box_of
 from wlm.probe.regions.model import Regions, box_row
 from wlm.probe.regions.tree import Tree
@@ -36,7 +34,6 @@ _FINISHED = {
     "box": Part(np.float64, (7,)),
     "count": Part(np.int32, (2,), least=0),
 }
-_CHUNK = {"cpu": 5, "cuda": 500}  # steps after which progress and checkpoint may be due
 
 
 def open_checkpoint(
@@ -79,6 +76,8 @@ def compress(
     *,
     seed: int = 0,
     device: str = "cpu",
+    workers: int | None = None,
+    cluster: str | None = None,
     progress: OnProgress | None = None,
     checkpoint: Checkpoint | None = None,
     positions: bool = False,
@@ -102,7 +101,9 @@ def compress(
         probes: The set.
         profile: The settings: a name, a YAML file, or a `Profile`.
         seed: Seed of the fit; the same seed gives the same result on one kind of device.
-        device: "cpu" or "cuda:N".
+        device: "cpu", "cuda" or "cuda:N".
+        workers, cluster: Where regions are fitted side by side, with the same result: see
+            `wlm.dispatch.Place`. A cluster also fits a set of one region.
         progress: Called about twice a second, with the live probes' relative error, "error", or with the PSNR over all
             numbers of all probes if the profile asks for the absolute error.
         checkpoint: From `open_checkpoint` for the same settings, or None. A running fit is saved there, and an
@@ -121,7 +122,8 @@ def compress(
         KeyboardInterrupt: Raised by `progress`, after the checkpoint, if there is one, has been written.
     """
     profile = Profile.load(profile).override(overrides)
-    device = interop.check_device(device)
+    place = Place(device, workers, cluster)
+    here = place.here
     if geometry is not None and profile.method != "gaussians":
         raise WlmError(f"mesh: expected the method gaussians, which alone is fitted to pictures, got {profile.method}")
     if not probes.live.any():
@@ -159,10 +161,10 @@ def compress(
     tree = Tree.split(probes.position[probes.live], profile.region)
     # Magnitudes follow each probe at each hour by themselves, and half floats would round a scale's logarithm.
     of_fit = (partial(make, scales=np.ones(hours)), probes) if profile.error == "relative" else (make, even)
-    pixels = None if geometry is None else seen_pixels(of_fit[1], geometry, device)
-    shared = {"seed": seed, "device": device, "progress": progress, "checkpoint": checkpoint}
+    pixels = None if geometry is None else seen_pixels(of_fit[1], geometry, here)
+    shared = {"seed": seed, "place": place, "progress": progress, "checkpoint": checkpoint}
     trained = partial(_fit_regions, *of_fit, tree=tree, pixels=pixels, **shared)
-    candidates = Candidates(make, probes, values[probes.live], profile, device, trained, checkpoint, tree.count)
+    candidates = Candidates(make, probes, values[probes.live], profile, here, trained, checkpoint, tree.count)
     return candidates.selected() if profile.target or profile.max_bytes else candidates.usual()
 
 
@@ -175,17 +177,21 @@ def _fit_regions(
     checkpoint: Checkpoint | None,
     progress: OnProgress | None,
     pixels: Pixels | None,
+    seed: int,
+    place: Place,
     number: int = 0,
-    **options: Any,
 ) -> ProbeModel:
     """Fits the Gaussians of each region, or of the set if it is one region. `number` is that of the fit in the
-    checkpoint; `options` are those of `_fit_gaussians`."""
+    checkpoint."""
     hours, live = max(len(probes.times), 1), probes.live
     profile = profile.model_copy(update={"method": "gaussians"})
     meter = Meter(progress, "fit", profile.steps * tree.count)
-    fit = partial(_fit_gaussians, meter=meter, checkpoint=checkpoint, **options)
+
+    fit = partial(run, (Fitter, seed), meter=meter, place=place, checkpoint=checkpoint)
     if tree.count == 1:
-        return fit([_Job(make, probes, profile, number, pixels)], 0)[0]
+        task = Task((number,), profile.steps, lambda: [Region(make, probes, profile, pixels)])
+        ((_, (model,)),) = fit([task])
+        return model
     position = probes.position[live]
     owner = tree.regions_of(position)
     # All regions together have as many Gaussians as one fit would have.
@@ -193,110 +199,47 @@ def _fit_regions(
     wanted = np.maximum(np.diff(np.rint(share), prepend=0.0), 1.0)
     results: dict[int, Mapping[str, np.ndarray]] = {}
     batches = (number + 1) * _BATCHES
-    at_once = _AT_ONCE["cpu" if options["device"] == "cpu" or pixels is not None else "cuda"]
+    at_once = _AT_ONCE["cpu" if place.device == "cpu" or pixels is not None else "cuda"]
+
+    def region(index: int) -> Region:
+        own = position[owner == index]
+        # The spacing of as many probes in a cube; on surfaces it is several times that of the probes.
+        margin = np.ptp(own, axis=0).max() / np.cbrt(len(own))
+        near = np.arange(len(position))
+        for column, low, high in zip(position.T, own.min(0) - margin, own.max(0) + margin, strict=True):
+            near = near[(column[near] >= low) & (column[near] <= high)]
+        chosen = np.flatnonzero(live)[near]
+        part = {"position": probes.position[chosen], "live": np.ones(len(chosen), bool), "normal": None}
+        near_set = replace(probes, values=probes.values[chosen], **part)
+        sized = profile.model_copy(update={"ratio": min(wanted[index] / len(chosen), 1.0)})
+        bare = {"probes": len(chosen), "dead": np.zeros(0, bool), "positions": np.zeros((0, 3), np.uint16)}
+        of_region = partial(make, **bare, **box_of(near_set.position))
+        return Region(of_region, near_set, sized, None if pixels is None else pixels.of(near))
+
+    tasks = []
     for first in range(0, tree.count, at_once):
-        jobs = []
-        for region in range(first, min(first + at_once, tree.count)):
-            if kept := checkpoint and checkpoint.finished(batches + region, _FINISHED):
-                results[region] = kept
-                continue
-            own = position[owner == region]
-            # The spacing of as many probes in a cube; on surfaces it is several times that of the probes.
-            margin = np.ptp(own, axis=0).max() / np.cbrt(len(own))
-            near = np.arange(len(position))
-            for column, low, high in zip(position.T, own.min(0) - margin, own.max(0) + margin, strict=True):
-                near = near[(column[near] >= low) & (column[near] <= high)]
-            chosen = np.flatnonzero(live)[near]
-            part = {"position": probes.position[chosen], "live": np.ones(len(chosen), bool), "normal": None}
-            near_set = replace(probes, values=probes.values[chosen], **part)
-            sized = profile.model_copy(update={"ratio": min(wanted[region] / len(chosen), 1.0)})
-            bare = {"probes": len(chosen), "dead": np.zeros(0, bool), "positions": np.zeros((0, 3), np.uint16)}
-            of_region = partial(make, **bare, **box_of(near_set.position))
-            seen = None if pixels is None else pixels.of(near)
-            jobs.append(_Job(of_region, near_set, sized, batches + region, seen))
-        for job, model in zip(jobs, fit(jobs, profile.steps * len(results)) if jobs else [], strict=True):
+        group: list[int] = []
+        for index in range(first, min(first + at_once, tree.count)):
+            if kept := checkpoint and checkpoint.finished(batches + index, _FINISHED):
+                results[index] = kept
+            else:
+                group.append(index)
+        if group:
+            numbers, job = (
+                tuple(batches + index for index in group),
+                partial(lambda each: list(map(region, each)), group),
+            )
+            tasks.append(Task(numbers, profile.steps * len(group), job, "Gaussians"))
+    for task, models in fit(tasks, done=profile.steps * len(results)):
+        for batch, model in zip(task.numbers, models, strict=True):
             count = np.array([model.content.settings()[name] for name in ("count", "dropped")], np.int32)
             result = {"packed": np.frombuffer(pack(model), np.uint8), "box": box_row(model), "count": count}
-            results[job.batch - batches] = result
+            results[batch - batches] = result
             if checkpoint is not None:
-                checkpoint.add_finished(job.batch, result)
+                checkpoint.add_finished(batch, result)
     ordered = [results[region] for region in range(tree.count)]
     boxes, counts = (np.stack([result[name] for result in ordered]) for name in ("box", "count"))
     packed = [result["packed"].tobytes() for result in ordered]
     content = Regions(tree, boxes, counts, profile, probes.outputs, hours, packed, probes.name)
     choice = f"Gaussians, in {tree.count} regions of at most {profile.region:,} live probes"
     return make(profile=profile, content=content, choice=choice)
-
-
-class _Job(NamedTuple):
-    """A fit of Gaussians: what makes its model, its set and profile, its number in the checkpoint, and pixels."""
-
-    make: Callable[..., ProbeModel]
-    probes: ProbeSet
-    profile: Profile
-    batch: int
-    pixels: Pixels | None
-
-
-def _fit_gaussians(
-    jobs: list[_Job], before: int, *, seed: int, device: str, meter: Meter, checkpoint: Checkpoint | None
-) -> list[ProbeModel]:
-    """Trains and quantises Gaussians (gaussian-probe-compression, sections 3.2 and 3.3), of several sets at once.
-    `meter` counts the steps from `before` on."""
-    trainers: list[Trainer] = []
-    try:
-        for _, probes, profile, batch, pixels in jobs:
-            hours, box = max(len(probes.times), 1), box_of(probes.position)
-            relative = hours * (profile.error == "relative")
-            check_outputs(probes.name, profile.latent, profile.hidden, hours * probes.outputs, relative, device)
-            x = ((probes.position[probes.live] - box["origin"]) / box["extent"]).astype(np.float32)
-            trainers.append(Trainer(x, probes.values[probes.live], profile, seed, device, hours, pixels))
-            if checkpoint is not None:
-                checkpoint.restore(batch, trainers[-1].load)
-                if trainers[-1].step != (done := trainers[0].step):
-                    raise checkpoint.wrong(batch, ValueError(f"part control: expected {done} steps, as its peers have"))
-        trainers[0].peers = trainers[1:]
-        _train(trainers, jobs, meter, before, checkpoint)
-        models = []
-        for (make, probes, profile, _, pixels), trainer in zip(jobs, trainers, strict=True):
-            trainer.finish()
-            mse, content = trainer.mse(), trainer.quantised()
-            if not (math.isfinite(mse) and np.isfinite(content.bounds).all() and np.isfinite(content.net).all()):
-                told = f"the fit diverged; use smaller learning rates than profile {profile.name}"
-                raise WlmError(f"{probes.name}: {told}")
-            fitted = make(profile=profile, content=content, choice="Gaussians, as the profile asks")
-            lit = probes.position[probes.live], probes.values[probes.live]
-            models.append(pack_model(fitted, *lit, device, pixels is not None))
-        return models
-    finally:
-        for trainer in trainers:
-            trainer.close()
-
-
-def _train(trainers: list[Trainer], jobs: list[_Job], meter: Meter, before: int, checkpoint: Checkpoint | None) -> None:
-    first, probes = trainers[0], jobs[0].probes
-    steps, chunk = first.steps, _CHUNK["cpu" if first.device == "cpu" else "cuda"]
-    peak, live = float(np.ptp(probes.values)), probes.live.mean()  # dead probes decode exactly, and count
-
-    def figures() -> dict[str, float]:
-        error = first.mse()
-        if first.relative:
-            return {"error": math.sqrt(error * (probes.outputs + 1))}
-        return {"PSNR_dB": psnr_from_mse(error * live, peak)}
-
-    def save() -> None:
-        if checkpoint is not None:
-            checkpoint.save({job.batch: trainer.state() for job, trainer in zip(jobs, trainers, strict=True)})
-
-    for start in range(first.step, steps, chunk):
-        step = min(start + chunk, steps)
-        first.run(step - start)
-        done = before + step * len(jobs)
-        if meter.due(done):
-            try:
-                meter.report(done, **figures())
-            except KeyboardInterrupt:
-                save()
-                raise
-        if checkpoint is not None and checkpoint.due():
-            save()

@@ -244,7 +244,7 @@ class ProbeModel(Model):
         """
         if not self.has_positions:
             raise WlmError(
-                f"{self.name}: the file stores no positions: pass those of its probes, or store them in the fit"
+                f"{self.name}: the file stores no positions: name that of its probes, or compress with --positions"
             )
         return self.origin + self.extent * self.size * (self.positions / CODES)
 

@@ -59,7 +59,7 @@ class Candidates:
         """Returns the model for a profile that names neither a target nor a number of bytes."""
         profile = self._profile
         if profile.method == "pca":
-            return self._measured(self._fitted(None, ENOUGH, "PCA, as the profile asks")[0])[0]
+            return self._measured(self._fitted(None, ENOUGH, "principal components, as the profile asks")[0])[0]
         if profile.method == "auto" and self._regions > 1:
             return self._measured(self._trained(profile))[0]
         count = gaussian_count(profile.ratio, self._live)
@@ -68,21 +68,21 @@ class Candidates:
             model, error = self._components(budget, ENOUGH)
             size = model.content.nbytes
             if size <= budget and error <= ENOUGH:
-                took = f"{model.content.count} components reach {error:.1%} of each probe's light in {size:,} bytes"
+                took = f"{model.content.count} have an error of {error:.1%} of each probe's light in {size:,} bytes"
                 model, _ = self._measured(model)
-                return replace(model, choice=f"PCA: {took} of GPU memory, Gaussians take {budget:,}")
+                return replace(model, choice=f"principal components: {took} of GPU memory; Gaussians take {budget:,}")
         gaussians, error = self._measured(self._trained(profile))
         if profile.method != "auto":
             return gaussians
         most = gaussians.content.nbytes
-        told = f"Gaussians reach an error of {error:.1%} in {most:,} bytes of GPU memory"
+        told = f"Gaussians have an error of {error:.1%} of each probe's light in {most:,} bytes of GPU memory"
         rival = model if size <= most else self._components(most, ENOUGH)[0]
         if rival.content.nbytes > most:
-            return replace(gaussians, choice=f"Gaussians: {told}, less than one PCA component takes")
+            return replace(gaussians, choice=f"{told}, less than one principal component takes")
         rival, possible = self._measured(rival)
         if possible < error:
-            return replace(rival, choice=f"PCA: {rival.content.count} components reach {possible:.1%}, {told}")
-        return replace(gaussians, choice=f"Gaussians: {told}, PCA of that size reaches {possible:.1%}")
+            return replace(rival, choice=f"principal components: {possible:.1%} in no more bytes; {told}")
+        return replace(gaussians, choice=f"{told}; principal components of that size {possible:.1%}")
 
     def selected(self) -> ProbeModel:
         """Returns the smallest model found that reaches the target, or the most exact one within the bytes."""
@@ -94,9 +94,8 @@ class Candidates:
             model, error = self._measured(self._components(profile.max_bytes, target)[0])
             size = model.content.nbytes
             if size <= limit:
-                found.append(
-                    (error, size, f"{model.content.count} PCA components reach {error:.1%} in {size:,}", model)
-                )
+                told = f"{model.content.count} components have an error of {error:.1%} in {size:,}"
+                found.append((error, size, told, model))
             if error <= target:
                 most = min(most, size - 1)  # more Gaussians than that would be no gain
         if profile.method != "pca":
@@ -110,13 +109,14 @@ class Candidates:
             if count:
                 error, model = self._error(count), self._gaussians(count)
                 size = model.content.nbytes
-                found.append((error, size, f"{model.content.count} Gaussians reach {error:.1%} in {size:,}", model))
+                told = f"{model.content.count} Gaussians have an error of {error:.1%} in {size:,}"
+                found.append((error, size, told, model))
         if not found:
             raise WlmError(f"{name}: max_bytes: expected more bytes, as no model of {self._live} probes fits {limit:,}")
         reached = [each for each in found if each[0] <= target]
         _, _, _, model = min(reached, key=lambda each: each[1]) if reached else min(found, key=lambda each: each[0])
         told = "; ".join(sentence for *_, sentence, _ in found)
-        kind = "PCA" if model.method == "pca" else "Gaussians"
+        kind = "principal components" if model.method == "pca" else "Gaussians"
         warnings = model.warnings
         if target and not reached:
             least = min(error for error, *_ in found)

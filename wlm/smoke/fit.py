@@ -11,7 +11,7 @@ import io
 import json
 import math
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from wlm.dispatch import Place
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_write
 from wlm.formats.checkpoint import EVERY, Checkpoint
@@ -68,8 +69,8 @@ def train(
     resume: bool = False,
     checkpoint_every: float = EVERY,
     progress: OnProgress | None = None,
-    make_pool: Callable[..., Pool] | None = None,
-    make_validation: Callable[..., Pool] | None = None,
+    workers: int | None = None,
+    cluster: str | None = None,
     **overrides: Mapping[str, Any],
 ) -> Training:
     """Trains a network and saves it as it was at its best validation.
@@ -88,7 +89,7 @@ def train(
             end of each round.
         progress: Called after each simulated sequence and every 50 steps, with the figures "PSNR dB" of the last
             validation and "loss", the mean of the round.
-        make_pool, make_validation: Replace the functions of these names in `network.dataset`.
+        workers, cluster: Where sequences are made side by side, see `wlm.dispatch.Place`; the network is trained here.
         **overrides: Replace settings of the profile: `training={"rounds": 2}`.
 
     Raises:
@@ -97,6 +98,8 @@ def train(
             be written or is being written by another process.
         KeyboardInterrupt: Raised by `progress`, after the checkpoint has been written.
     """
+    # A training is on a device of this machine, that of a cluster is any of its kind.
+    place = Place(device if cluster is None else device.partition(":")[0], workers, cluster)
     profile, device = Profile.load(profile).override(overrides), check_device(device)
     fit = {
         **profile.model_dump(mode="json", include={"network", "training", "dataset"}),
@@ -110,13 +113,13 @@ def train(
             raise WlmError(f"{output}: cannot resume: the training is finished; start anew without --resume")
         meter = Meter(progress, "train", profile.training.total)
         run = _Run(profile, Path(output), device, checkpoint, meter, seed, minutes)
-        make_pool, make_validation = make_pool or dataset.make_pool, make_validation or dataset.make_validation
+        options = {"device": device, "place": place, "progress": run.report}
         # Stopping between two sequences of a pool loses nothing: earlier steps are in the checkpoint.
-        validation = make_validation(profile.dataset, device, progress=run.report)
+        validation = dataset.make_validation(profile.dataset, **options)
         _check_pool("validation", validation)
         run.begin(validation)
         while run.round < profile.training.rounds:
-            pool = make_pool(profile.dataset, seed=seed, round=run.round, device=device, progress=run.report)
+            pool = dataset.make_pool(profile.dataset, seed=seed, round=run.round, **options)
             _check_pool(f"round {run.round}", pool)
             if not run.do_round(pool):
                 return run.result(False)

@@ -87,9 +87,8 @@ class Window:
         if not np.isfinite(degrees):
             raise WlmError(f"turn: expected a finite number of degrees, got {degrees}")
         camera, axis = self.canvas.renderers[0].camera, np.eye(3)[self.scene.up]
-        focus = np.array(camera.focal_point)
-        camera.position = focus + _turned(np.array(camera.position) - focus, axis, np.radians(degrees))
         camera.up = axis
+        camera.Azimuth(degrees)
         self._clip()
 
     def advance(self, seconds: float) -> None:
@@ -160,6 +159,7 @@ class Window:
             )
 
         self._texts = {"caption": text("caption", _INDENT, _CAPTION), "keys": text("keys", _INDENT, _KEYS)}
+        colour = need("pyvista", "view").Color
         for name, slider in self.sliders.items():
             label = text(f"slider {name}", 0.0, _LABELS)
             widget = plotter.add_slider_widget(
@@ -174,8 +174,8 @@ class Window:
             shape.SetSliderWidth(0.16)
             shape.SetTubeWidth(0.04)
             shape.SetEndCapLength(0.0)
-            shape.GetSliderProperty().SetColor(_rgb(_BAR))
-            shape.GetTubeProperty().SetColor(_rgb(_INK))
+            shape.GetSliderProperty().SetColor(colour(_BAR).float_rgb)
+            shape.GetTubeProperty().SetColor(colour(_INK).float_rgb)
             self._widgets[name] = widget, label
         self._keys = {
             "space": self._toggle,
@@ -284,13 +284,3 @@ class Window:
     def _clip(self) -> None:
         for renderer in self.canvas.renderers:
             renderer.ResetCameraClippingRange()
-
-
-def _turned(vector: np.ndarray, axis: np.ndarray, angle: float) -> np.ndarray:
-    return (
-        vector * np.cos(angle) + np.cross(axis, vector) * np.sin(angle) + axis * (axis @ vector) * (1.0 - np.cos(angle))
-    )
-
-
-def _rgb(colour: str) -> tuple[float, ...]:
-    return tuple(int(colour[i : i + 2], 16) / 255.0 for i in (1, 3, 5))

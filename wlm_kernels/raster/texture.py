@@ -1,4 +1,4 @@
-"""Bilinear and nearest texture reads, and their backward pass (lightmap-uv-clustering-cascade, section 3.3.2).
+"""Bilinear and nearest reads of texels, and their derivatives (lightmap-uv-clustering-cascade, section 3.3.2).
 
 u points right and v down, row 0 is at v = 0; texel i of n has its centre at (i + 1/2) / n. The boundary mode
 says what coordinates outside [0, 1] read:
@@ -11,8 +11,8 @@ says what coordinates outside [0, 1] read:
 Coordinates are float32, but weights are computed in float64: at 4,096 texels float32 would leave them 12 bits. A
 coordinate that is NaN, or infinite and not clamped, reads NaN; it has no gradient, and adds none to the texture.
 
-Other kernels read textures with `axis_at`, `read`, `read_slope` and `add`. One `Axis` for u and one for v suffice for
-all channels and their gradients.
+Kernels read textures with `axis_at`, `read`, `read_slope` and `add`. One `Axis` for u and one for v suffice for all
+channels and their gradients. `wlm_kernels.raster.mips` has kernels that do only this.
 
 Read `benchmarks/plain.py` first (`texture`), which does the same with torch's `grid_sample`.
 """
@@ -25,7 +25,7 @@ BOUNDARIES = ("clamp", "wrap", "mirror")
 FILTERS = ("linear", "nearest")
 
 _WRAP, _MIRROR = (wp.constant(BOUNDARIES.index(name)) for name in ("wrap", "mirror"))
-_NEAREST = wp.constant(FILTERS.index("nearest"))
+NEAREST = wp.constant(FILTERS.index("nearest"))
 
 
 @wp.struct
@@ -80,7 +80,7 @@ def axis_at(x: float, size: int, filter: int, boundary: int) -> Axis:
         out.weight = wp.nan
         return out
     t = wp.clamp(t, wp.float64(0.0), wp.float64(1.0))
-    if filter == _NEAREST:
+    if filter == NEAREST:
         out.low = wp.min(int(t * n), size - 1)
         out.high = out.low
         return out
@@ -147,52 +147,6 @@ def add(grad: wp.array3d[float], x: Axis, y: Axis, c: int, g: float):
             wp.atomic_add(grad, y.high, x.high, c, x.weight * bottom)
 
 
-@wp.kernel
-def _sample(
-    # in:
-    texture: wp.array3d[float],
-    uv: wp.array1d[wp.vec2],
-    filter: int,
-    boundary: int,
-    # out:
-    out: wp.array2d[float],
-):
-    i = wp.tid()
-    x = axis_at(uv[i][0], texture.shape[1], filter, boundary)
-    y = axis_at(uv[i][1], texture.shape[0], filter, boundary)
-    for c in range(texture.shape[2]):
-        out[i, c] = read(texture, x, y, c)
-
-
-@wp.kernel
-def _sample_backward(
-    # in:
-    texture: wp.array3d[float],
-    uv: wp.array1d[wp.vec2],
-    filter: int,
-    boundary: int,
-    grad_out: wp.array2d[float],
-    # out:
-    grad_texture: wp.array3d[float],
-    grad_uv: wp.array1d[wp.vec2],
-):
-    i = wp.tid()
-    x = axis_at(uv[i][0], texture.shape[1], filter, boundary)
-    y = axis_at(uv[i][1], texture.shape[0], filter, boundary)
-    if grad_texture.shape[0] > 0:
-        for c in range(texture.shape[2]):
-            add(grad_texture, x, y, c, grad_out[i, c])
-    if grad_uv.shape[0] > 0:
-        grad_u = float(0.0)
-        grad_v = float(0.0)
-        if filter != _NEAREST:
-            for c in range(texture.shape[2]):
-                slope = read_slope(texture, x, y, c)
-                grad_u += grad_out[i, c] * slope[0]
-                grad_v += grad_out[i, c] * slope[1]
-        grad_uv[i] = wp.vec2(grad_u, grad_v)
-
-
 def codes(filter: str, boundary: str) -> tuple[int, int]:
     """Returns the integer codes by which kernels know a filter and a boundary mode: "linear" interpolates between the
     four nearest texels, "nearest" reads the nearest one; the module describes "clamp", "wrap" and "mirror"."""
@@ -200,24 +154,3 @@ def codes(filter: str, boundary: str) -> tuple[int, int]:
         if value not in names:
             raise ValueError(f"{name}: expected {' or '.join(names)}, got {value!r}")
     return FILTERS.index(filter), BOUNDARIES.index(boundary)
-
-
-def sample(texture, uv, out, *, filter: str = "linear", boundary: str = "clamp") -> None:
-    """Reads a texture, float [H, W, C], at N points with any coordinates, vec2 [N]; writes `out`, float [N, C]. `codes`
-    explains filter and boundary."""
-    inputs = [texture, uv, *codes(filter, boundary)]
-    wp.launch(_sample, uv.shape, inputs=inputs, outputs=[out], device=texture.device)
-
-
-def sample_backward(
-    texture, uv, grad_out, grad_texture, grad_uv, *, filter: str = "linear", boundary: str = "clamp"
-) -> None:
-    """Computes the gradients of the texture and of uv from `grad_out`, float [N, C], the gradient of a result of
-    `sample`, and its arguments.
-
-    `grad_texture`, float [H, W, C], is added to, `grad_uv`, vec2 [N], is written; with no elements they are not wanted.
-    The gradient of a coordinate is the slope between the texels that it reads, 0 at a clamped border. On CUDA samples
-    are added in any order, so that the last bits of `grad_texture` change from run to run.
-    """
-    inputs = [texture, uv, *codes(filter, boundary), grad_out]
-    wp.launch(_sample_backward, uv.shape, inputs=inputs, outputs=[grad_texture, grad_uv], device=texture.device)

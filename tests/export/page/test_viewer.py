@@ -30,8 +30,8 @@ ATLASES = [
     ("plain with uv", "bc6h"),
 ]
 MADE = {
-    "paper": lambda: synthetic.random_model((3, 2, 4, 1), hidden=18, plane_rows=5, time_axis="paper", gelu="exact"),
-    "network": lambda: synthetic.random_model((3, 2, 3, 1, 3, 0), 3, interpolation="network", gamma=1.8),
+    "paper": lambda: synthetic.random_model((3, 3, 4, 1), hidden=18, plane_rows=5, time_axis="paper", gelu="exact"),
+    "network": lambda: synthetic.random_model((3, 3, 3, 1, 3, 0), 3, interpolation="network", gamma=1.8),
     "spheres": lambda: probe_models.whole_model(positions=True, support="sphere", error="absolute", outputs=12),
     "units": lambda: _components(np.random.default_rng(2).random((4, 27))),
     "hours": lambda: _components(np.random.default_rng(3).random((2, 30, 27)), times=(3.0, HOUR)),

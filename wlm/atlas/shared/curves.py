@@ -13,6 +13,7 @@ import functools
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,11 +21,13 @@ import torch
 from wlm.atlas.colour import stored
 from wlm.atlas.model import BLOCK_SIDE, COLOUR_BITS, FACTOR_BITS, MOST_COARSE, extent
 from wlm.atlas.shared.mixture import Mixtures, find_mixtures, moments
-from wlm.atlas.stages import Stages
+from wlm.atlas.stages import Stages, one_thread
 from wlm.atlas.tiles.fit import Tiles, errors, sample_weights, solve, tile_light
 from wlm.atlas.tiles.layout import Size, allocate
+from wlm.dispatch import Task, Whole, gathered
 from wlm.formats.float_texels import MOST_SIDE
 from wlm.formats.parts import Part
+from wlm.interop import check_device, moved
 from wlm.system import Meter
 
 _RANKS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)  # candidate numbers of components
@@ -37,6 +40,7 @@ _SAMPLES, _MOMENTS, _SAMPLE_TEXELS = 8192, 1 << 24, 16
 _PAYS = 0.99  # more components must reduce the error below this fraction, or no more are tried
 _ROUGH, _MEDIUM = 3, 10  # rounds of conjugate gradients for a curve, and for one of blocks
 _AT_ONCE = 1024  # tiles
+_PIECES = 1_000_000  # numbers in the checkpoint for the tiles of each number of components
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +64,10 @@ class SceneTiles:
     def weights(self) -> np.ndarray:
         """The weight of each tile, float64 [T]."""
         return self.weight.double().sum(1).cpu().numpy()
+
+    def part(self, at: np.ndarray) -> "SceneTiles":
+        """Returns the tiles of some numbers alone."""
+        return replace(self, **{name: getattr(self, name)[at] for name in ("texels", "weight", "plane", "index")})
 
     def light(self, at: np.ndarray | slice) -> tuple[torch.Tensor, torch.Tensor]:
         """Returns the texels of the tiles `at` and the weights of their points, copied to the device."""
@@ -153,11 +161,17 @@ def candidates(
         choices, number = choices_of(rank, sizes), np.zeros(count, int)
         # A tile that isn't tried gains nothing.
         error = np.repeat(tried[0].error.max(0)[None], len(choices), 0) if tried else np.zeros((len(choices), count))
-        parts = {"number": Part(np.int64, (len(eager),), least=0, most=len(mixtures.factor) - 1)}
-        parts["error"] = Part(np.float64, (len(choices), len(eager)), least=0.0)
-        make = functools.partial(_curves, tiles, eager, mixtures, sizes, choices, meter, done * count)
-        kept = stages.batch(batch + done, parts, make)
-        number[eager], error[:, eager] = kept["number"], kept["error"]
+        step = max(1, min(2 * _AT_ONCE, 8 * _AT_ONCE // rank))
+        pieces, tasks = np.split(eager, range(step, len(eager), step)), []
+        for i, piece in enumerate(pieces, (batch + done) * _PIECES):
+            table = {"number": Part(np.int64, (len(piece),), least=0, most=len(mixtures.factor) - 1)}
+            table["error"] = Part(np.float64, (len(choices), len(piece)), least=0.0)
+            job = functools.partial(_job, tiles, piece, mixtures, sizes, choices)
+            tasks.append(Task((i,), len(piece), job, table=table))
+        options = stages.place, stages.checkpoint, done * count
+        for i, kept in gathered((CurveMaker,), tasks, meter, *options).items():
+            piece = pieces[i - (batch + done) * _PIECES]
+            number[piece], error[:, piece] = kept["number"], kept["error"]
         tried.append(Candidate(mixtures, number, choices, error, 0.0))
         left, chosen = _left(tried, bits)
         tried[-1] = replace(tried[-1], left=left)
@@ -169,47 +183,45 @@ def candidates(
     return tried
 
 
-def _curves(
-    tiles: SceneTiles,
-    members: np.ndarray,
-    mixtures: Mixtures,
-    sizes: list[Size],
-    choices: list[Choice],
-    meter: Meter,
-    done: int,
-) -> dict[str, np.ndarray]:
-    """Returns for the T tiles `members` their mixtures, int [T], and errors for each choice, [choices, T], by name."""
-    device, (_, states, rank, _) = tiles.device, mixtures.factor.shape
-    mixtures = mixtures.to(device)
-    factor, offset = mixtures.factor, mixtures.offset
-    number, error = np.zeros(len(members), np.int64), np.zeros((len(choices), len(members)))
-    block = next((i for i, size in enumerate(sizes) if size.second and size.nx * size.ny == BLOCK_SIDE**2), 0)
-    place = {size: i for i, size in enumerate(sizes)}
-    step = max(1, _AT_ONCE * 8 // rank)
-    for at in range(0, len(members), step):
-        if meter.due(done + at):
-            meter.report(done + at)
-        part = slice(at, at + step)
-        texels, weight = tiles.light(members[part])
-        light = tiles.points(texels)
-        chosen = mixtures.nearest(moments(light, weight))
-        components = tiles.points(tiles.components(texels, mixtures, chosen))
-        rest = torch.einsum("tmkc,tkcp->tmcp", factor[chosen], components - offset[chosen][..., None]) - light
-        lost = (rest.square().mean((1, 2)) * weight).double().sum(1)
-        whole, shares = chosen.repeat_interleave(rank), weight.repeat_interleave(rank, 0)
-        piece = Tiles(whole, components.flatten(0, 1).contiguous(), shares, tiles.size)
-        # The error of each component alone.
-        alone = torch.empty((len(sizes), len(chosen), rank), dtype=torch.float64, device=device)
-        for i, size in enumerate(sizes):
-            samples = solve(piece, size.nx, size.ny, _MEDIUM if size.second else _ROUGH).clamp(min=0.0)
-            held = stored(samples, sample_weights(piece, size.nx, size.ny), size.format)
-            alone[i] = errors(piece, held).unflatten(0, (-1, rank)) / states
-        for i, choice in enumerate(choices):
-            whole = rank - choice.coarse
-            left = alone[place[choice.size], :, :whole].sum(1) + alone[block, :, whole:].sum(1)
-            error[i, part] = (left + lost).cpu().numpy()
-        number[part] = chosen.cpu().numpy()
-    return {"number": number, "error": error}
+def _job(tiles: SceneTiles, piece: np.ndarray, *settings: Any) -> tuple[Any, ...]:
+    return tiles.part(piece), *settings
+
+
+class CurveMaker(Whole):
+    """Computes the errors of groups of tiles for each choice of their components."""
+
+    def __init__(self, device: str) -> None:
+        self._device = check_device(device)
+
+    def run(self, job: tuple[SceneTiles, Mixtures, list[Size], list[Choice]]) -> dict[str, np.ndarray]:
+        """Returns for T tiles their mixtures, int [T], and errors for each choice, [choices, T], by name."""
+        tiles, mixtures, sizes, choices = replace(job[0], device=self._device), *job[1:]
+        with one_thread(self._device):
+            device, (_, states, rank, _) = tiles.device, mixtures.factor.shape
+            mixtures = moved(mixtures, device)
+            factor, offset = mixtures.factor, mixtures.offset
+            block = next((i for i, size in enumerate(sizes) if size.second and size.nx * size.ny == BLOCK_SIDE**2), 0)
+            place = {size: i for i, size in enumerate(sizes)}
+            texels, weight = tiles.light(slice(None))
+            light = tiles.points(texels)
+            chosen = mixtures.nearest(moments(light, weight))
+            components = tiles.points(tiles.components(texels, mixtures, chosen))
+            rest = torch.einsum("tmkc,tkcp->tmcp", factor[chosen], components - offset[chosen][..., None]) - light
+            lost = (rest.square().mean((1, 2)) * weight).double().sum(1)
+            whole, shares = chosen.repeat_interleave(rank), weight.repeat_interleave(rank, 0)
+            piece = Tiles(whole, components.flatten(0, 1).contiguous(), shares, tiles.size)
+            # The error of each component alone.
+            alone = torch.empty((len(sizes), len(chosen), rank), dtype=torch.float64, device=device)
+            for i, size in enumerate(sizes):
+                samples = solve(piece, size.nx, size.ny, _MEDIUM if size.second else _ROUGH).clamp(min=0.0)
+                held = stored(samples, sample_weights(piece, size.nx, size.ny), size.format)
+                alone[i] = errors(piece, held).unflatten(0, (-1, rank)) / states
+            error = np.zeros((len(choices), len(chosen)))
+            for i, choice in enumerate(choices):
+                whole = rank - choice.coarse
+                left = alone[place[choice.size], :, :whole].sum(1) + alone[block, :, whole:].sum(1)
+                error[i] = (left + lost).cpu().numpy()
+            return {"number": chosen.cpu().numpy(), "error": error}
 
 
 def costs(tried: list[Candidate]) -> np.ndarray:

@@ -25,6 +25,7 @@ from wlm.atlas.stages import Stages
 from wlm.atlas.tiles.fit import Tiles, solved
 from wlm.atlas.tiles.layout import Size, texels_of
 from wlm.formats.shared_exponent import pack_rgb9e5, unpack_rgb9e5
+from wlm.interop import moved
 
 _AT_ONCE = 1024  # tiles
 _BRIGHT = 1024.0  # a component's largest texel after scaling: RGB9E5 has as many octaves below it as above
@@ -101,7 +102,7 @@ def _textures(tiles: SceneTiles, tried: list[Candidate], given: Allocated) -> tu
         members = np.flatnonzero(given.rank == rank)
         for part in np.array_split(members, -(-len(members) // _AT_ONCE)) if len(members) else ():
             texels, weight = tiles.light(part)
-            mixtures, mixture = each.mixtures.to(tiles.device), torch.from_numpy(each.number[part]).to(tiles.device)
+            mixtures, mixture = moved(each.mixtures, tiles.device), torch.from_numpy(each.number[part]).to(tiles.device)
             components = tiles.points(tiles.components(texels, mixtures, mixture))
             kinds = np.column_stack([given.size[part], given.second[part]])
             sides, chosen = np.unique(kinds, axis=0, return_inverse=True)

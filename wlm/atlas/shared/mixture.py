@@ -15,7 +15,7 @@ unsigned texels can store it, while factors have any sign; a constant for each s
 directions are orthonormal, errors of components are independent, and none is amplified.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -41,10 +41,6 @@ class Mixtures:
     factor: torch.Tensor
     offset: torch.Tensor
     kept: torch.Tensor
-
-    def to(self, device: str) -> "Mixtures":
-        """Returns a copy of the mixtures on a device."""
-        return Mixtures(*(getattr(self, each.name).to(device) for each in fields(self)))
 
     def factors(self, number: int) -> np.ndarray:
         """Returns a mixture's light if all components are 0, then its factors by component: float64 [1 + K, M, 3]."""

@@ -222,8 +222,7 @@ def _hopeless(
     own = float(taken[few].sum()) / float(taken.sum()) * room
     # The sample has the same tiles in each state.
     members = (np.arange(states)[:, None] * count + few).ravel()
-    arrays = (each[members] for each in (tiles.texels, tiles.weight, tiles.plane, tiles.index))
-    tried = candidates(SceneTiles(*arrays, tiles.size, tiles.device), sizes_of(profile), own, seed, stages, _SAMPLED)
+    tried = candidates(tiles.part(members), sizes_of(profile), own, seed, stages, _SAMPLED)
     error = np.concatenate([each.error for each in tried]) * np.tile(factor[few], states)
     separate = allocate(error, costs(tried), own, 0.0)
     return float(error[separate, np.arange(len(members))].sum()) > _HOPELESS * float(given.error[few].sum())

@@ -96,7 +96,7 @@ class Components(Content):
     def facts(self) -> dict[str, Any]:
         basis = "principal components" if len(self.basis) else "unit vectors"
         bits = round(float(self.bits[self.cluster].mean()), 1)
-        return {"components": self.count, "clusters": self.clusters, "bits": bits, "basis": basis}
+        return {"components": self.count, "clusters": self.clusters, "GPU_bits_per_probe": bits, "basis": basis}
 
     def settings(self) -> dict[str, int]:
         return ({"count": self.count} if len(self.basis) else {}) | (

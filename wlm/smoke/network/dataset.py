@@ -11,11 +11,13 @@ network must be made with `DatasetSettings.look` of the settings that it was tra
 
 from collections.abc import Sequence
 from dataclasses import fields, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 import torch
 
+from wlm.dispatch import Place, Task, Whole, gathered
 from wlm.errors import WlmError
 from wlm.fluid.solver import Solver
 from wlm.interop import check_device, stream
@@ -37,7 +39,13 @@ _EARLY = 0.35  # factor of the warmup for sources that stop early
 
 
 def make_pool(
-    settings: DatasetSettings, *, seed: int, round: int = 0, device: str = "cpu", progress: OnProgress | None = None
+    settings: DatasetSettings,
+    *,
+    seed: int,
+    round: int = 0,
+    device: str = "cpu",
+    place: Place | None = None,
+    progress: OnProgress | None = None,
 ) -> Pool:
     """Makes the samples of one training round, from sequences that no other round uses.
 
@@ -46,14 +54,15 @@ def make_pool(
         seed: Seed of all rounds, at least 0.
         round: Number of the round, from 0.
         device: "cpu", "cuda" or "cuda:N".
-        progress: Called after each sequence with the figures "samples", "skipped" scenes, and "dropped" samples without
-            smoke.
+        place: Where sequences are made side by side, with the same result; None: one after another on the device.
+        progress: Called after each sequence.
 
     Returns:
         At most sequences x frames x views_a_frame samples, on the device. The same arguments give the same bits on one
         device.
     """
-    return _Maker(settings, seed, False, device).pool(round * settings.sequences, settings.sequences, progress)
+    numbers = range(round * settings.sequences, (round + 1) * settings.sequences)
+    return _pool((settings, seed, False), numbers, device, place, progress)
 
 
 def make_validation(
@@ -61,12 +70,22 @@ def make_validation(
     device: str = "cpu",
     *,
     test: bool = False,
+    place: Place | None = None,
     progress: OnProgress | None = None,
 ) -> Pool:
     """Makes the samples of the validation or, with `test_seed`, the test set; each pair of frames is rendered from all
     fixed views. No training round uses the sequences of these sets."""
     seed = settings.test_seed if test else settings.validation_seed
-    return _Maker(settings, seed, True, device).pool(0, settings.validation_sequences, progress)
+    return _pool((settings, seed, True), range(settings.validation_sequences), device, place, progress)
+
+
+def _pool(arguments: tuple, numbers: range, device: str, place: Place | None, progress: OnProgress | None) -> Pool:
+    """Makes sequences by `SequenceMaker`, which takes the arguments; returns the samples of all in one pool."""
+    meter = Meter(progress, "dataset", len(numbers), every=0.0)
+    tasks = [Task((each,), 1, partial(int, each)) for each in numbers]
+    made = gathered((SequenceMaker, *arguments), tasks, meter, place or Place(device))
+    parts = ([getattr(made[each], name.name) for each in numbers] for name in fields(Pool))
+    return Pool(*map(torch.cat, parts)).to(check_device(device))
 
 
 def fixed_cameras(settings: DatasetSettings, origin: Sequence[float] | np.ndarray, size: np.ndarray) -> list[Camera]:
@@ -84,30 +103,17 @@ class _Shot(NamedTuple):
     seed: int
 
 
-class _Maker:
-    """Simulates and renders the samples of a training, validation or test set."""
+class SequenceMaker(Whole):
+    """Simulates and renders sequences of a training, validation or test set, by their numbers."""
 
-    def __init__(self, settings: DatasetSettings, seed: int, validation: bool, device: str) -> None:
+    def __init__(self, device: str, settings: DatasetSettings, seed: int, validation: bool) -> None:
         self._settings, self._seed, self._validation = settings, seed, validation
         self._device = check_device(device)
 
-    def pool(self, first: int, count: int, progress: OnProgress | None) -> Pool:
-        """Simulates and renders `count` sequences from number `first` on; returns the samples of all in one pool."""
-        meter = Meter(progress, "dataset", count)
-        pools: list[Pool] = []
-        samples = skipped = dropped = 0
-        for number in range(first, first + count):
-            pool, unstable, empty = self._sequence(number)
-            pools.append(pool)
-            samples, skipped, dropped = samples + len(pool), skipped + unstable, dropped + empty
-            if progress is not None:
-                meter.report(len(pools), samples=samples, skipped=skipped, dropped=dropped)
-        return Pool(*(torch.cat([getattr(pool, field.name) for pool in pools]) for field in fields(Pool)))
-
-    def _sequence(self, number: int) -> tuple[Pool, int, int]:
-        """Simulates a random scene; returns its samples, and how many unstable scenes and empty samples it left out."""
+    def run(self, job: int) -> Pool:
+        """Simulates a random scene, or the next one if it is unstable; returns its samples in the host's memory."""
         for attempt in range(ATTEMPTS):
-            index = number * ATTEMPTS + attempt
+            index = job * ATTEMPTS + attempt
             settings = self._sequence_settings(index)
             scene = draw_scene(settings, self._seed, index, validation=self._validation)
             random = generator(self._validation, self._seed, index, 1)
@@ -130,7 +136,7 @@ class _Maker:
             covered = pool.covered().cpu().numpy()
             kept_at_random = random.random(len(covered)) < self._settings.kept_empty
             keep = np.flatnonzero((covered > self._settings.least_coverage) | kept_at_random)
-            return pool.take(torch.from_numpy(keep).to(pool.device)), attempt, len(pool) - len(keep)
+            return pool.take(torch.from_numpy(keep).to(pool.device)).to("cpu")
         raise WlmError(f"{ATTEMPTS} random scenes in a row were unstable, the last with the problem: {problem}")
 
     def _sequence_settings(self, index: int) -> DatasetSettings:

@@ -15,7 +15,7 @@ import torch
 
 from wlm.errors import WlmError
 from wlm.fluid.volume import DensityVolume
-from wlm.interop import check_device, device_name, stream
+from wlm.interop import check_device, device_name, moved, stream
 from wlm.smoke.camera import Camera
 from wlm.smoke.codec import open_network
 from wlm.smoke.decode import Decoder
@@ -75,8 +75,7 @@ class SmokePredictor:
             WlmError: The network predicts NaN or infinity.
         """
         if device_name(smoke.device) != self.device:
-            hot = None if smoke.temperature is None else smoke.temperature.to(self.device)
-            smoke = replace(smoke, density=smoke.density.to(self.device), temperature=hot)
+            smoke = moved(smoke, self.device)
         size = (camera.height, camera.width)
         if size not in self._decoders:
             if len(self._decoders) == _SIZES:
