@@ -202,7 +202,6 @@ _TABLES: dict[str, dict[str, Figure]] = {
         "times": Figure("times", form=_WHOLE),
         "times_scored": Figure("scored", form=_WHOLE),
         "constant_tiles": Figure("constant tiles", form=_WHOLE),
-        "static_tiles": Figure("static tiles", form=_WHOLE),
         "dynamic_tiles": Figure("dynamic tiles", form=_WHOLE),
         "frames_tiles": Figure("tiles of frames", form=_WHOLE),
         "tiles_timed": Figure("tiles timed", form=_WHOLE),

@@ -46,6 +46,7 @@ from wlm.smoke.march.six_way import bake_coarse, coarse_march, guide
 from wlm.smoke.shading import Light
 from wlm.smoke.transport.orders import scatter
 from wlm_kernels.fluid import advection, advection_places
+from wlm_kernels.lightmap.features import INPUTS
 from wlm_kernels.smoke.settings import March
 
 
@@ -104,8 +105,8 @@ _SPEED = 0.1
 
 def _network_work(profile: LightmapProfile) -> tuple[float, float]:
     """Returns operations and activations of the network at one texel."""
-    inputs, hidden = profile.inputs(True), profile.hidden
-    return 2.0 * (inputs * hidden + hidden * hidden + 3 * hidden), 2.0 * hidden
+    hidden = profile.hidden
+    return 2.0 * (INPUTS * hidden + hidden * hidden + 3 * hidden), 2.0 * hidden
 
 
 def _lightmap(name: str, side: int) -> tuple[LightmapModel, float]:
@@ -151,18 +152,18 @@ def _lightmap_step(device: str, tiles: int) -> tuple[Callable[[], object], Work]
     profile = LightmapProfile.load("M").for_times(_HOURS)
     day = from_arrays(light, times, period=24.0)
     targets = dynamic_targets(day.light, profile)
-    trainer = LightmapTrainer(profile, TimeAxis(day.times, day.period, profile.time_axis), targets, True, 0, device)
+    trainer = LightmapTrainer(profile, TimeAxis(day.times, day.period, profile.time_axis), targets, 0, device)
     operations, activations = _network_work(profile)
     samples = float(profile.samples * tiles)
     # Adam reads and writes a parameter and its two moments, and reads its gradient, in float32.
     parameters = float(trainer.maps.numel() + trainer.hidden.numel() + trainer.output.numel())
-    # A sample adds to 8 endpoints and a weight of the first map, to as many at 8 corners of the second, and to 16
-    # numbers of planes.
+    # A sample adds to 8 endpoints and a weight of the first map; in two slices of the second one to 4 weights and to
+    # the endpoints of the blocks that its corners lie in, 25 / 16 on average; and to 16 numbers of planes.
     work = Work(
         bytes=28.0 * parameters,
         tensor=3.0 * operations * samples,
         special=activations * samples,
-        atomics=(9.0 + 8.0 * 9.0 + 16.0) * samples,
+        atomics=(9.0 + 2.0 * (4.0 + 8.0 * 25.0 / 16.0) + 16.0) * samples,
     )
     return lambda: trainer.run(_STEPS), work
 

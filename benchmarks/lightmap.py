@@ -161,10 +161,10 @@ def run_rows(
     fits = [bench.fit_profile(profile) for profile in profiles]
     peers = []
     for fit in fits:
-        makers = (bench.profile_row, bench.texture_row, *[bench.pages_row] * bool(len(fit.model.light.mapped)))
+        makers = (bench.profile_row, bench.texture_row, *[bench.pages_row] * bool(len(fit.model.light.uv)))
         peers += [make(fit) for make in makers]
     best = next((fit for fit in fits if fit.option == "M"), fits[0])
-    if len(best.model.light.mapped):
+    if len(best.model.light.uv):
         # On the CPU "fast" is "tanh".
         gelus = [gelu for gelu in _GELUS if bench.device != "cpu" or gelu != "fast"]
         peers += [bench.option_row(best, "exact", gelu) for gelu in gelus]
@@ -172,7 +172,7 @@ def run_rows(
             peers.append(bench.option_row(best, "matrix", "fast"))
     rows = bench.time_rows(peers)
     rows += [bench.rival_row(name) for name in rivals]
-    rows += [bench.fit_row(fit) for fit in fits if len(fit.model.light.mapped)]
+    rows += [bench.fit_row(fit) for fit in fits if len(fit.model.light.uv)]
     return rows + bench.plain_rows(best)
 
 
@@ -275,7 +275,7 @@ class _LightmapBench(Bench):
             encode_seconds=fit.seconds,
             load_ms=_load_ms(model),
             max_error=error,
-            steps=model.profile.steps if len(model.mapped) else None,
+            steps=model.profile.steps if len(model.uv) else None,
             **self._score(frames.values(), fit.option, decode=decoder.frame),
             **self._tiles(model),
         )
@@ -436,7 +436,7 @@ class _LightmapBench(Bench):
         return image
 
     def _tiles(self, model: SheetModel) -> dict[str, int]:
-        """Returns the number of tiles of each kind: constant, static, dynamic and stored frames, but not empty."""
+        """Returns the number of tiles of each kind: constant, dynamic and stored frames, but not empty."""
         kinds = count_kinds(model).items()
         return {f"{kind}_tiles": count for kind, count in kinds if count and kind != "empty"}
 
@@ -491,8 +491,6 @@ class _LightmapBench(Bench):
                 decoders.append(MatrixDecoder(model, self.device))
             else:
                 decoders.append(ExactDecoder(model, self.device, gelu))
-        if (model.kind == TileKind.STATIC).any():
-            decoders.append(ExactDecoder(model, self.device, gelu, TileKind.STATIC))
         if len(model.frames):
             decoders.append(FrameDecoder(model, self.device))
         for decoder in decoders:

@@ -41,10 +41,10 @@ def _colour(model: SheetModel, number: int, time: float) -> np.ndarray:
     if model.kind[number] == TileKind.EMPTY:
         return np.zeros((TILE, TILE, 3))
     before, after, share = model.axis.neighbours(time)
-    place = model.map_row(number)
-    scale = model.scales[place].astype(np.float64)  # [T, 3]
-    shift, spread = model.affine[place].astype(np.float64)
-    output = _network_output(model, number, place, time)
+    row = model.row(number)
+    scale = model.scales[row].astype(np.float64)  # [T, 3]
+    shift, spread = model.affine[row].astype(np.float64)
+    output = _network_output(model, row, time)
     colour = (shift + spread * output) * ((1.0 - share) * scale[before] + share * scale[after])
     return np.maximum(colour, 0.0)
 
@@ -66,7 +66,7 @@ def bound64(model: SheetModel, number: int, time: float) -> float:
     if model.kind[number] == TileKind.FRAMES:
         peak = model.ranges[model.row(number), :, 1].max(1)
     else:
-        peak = decode_scale(model.peak[model.map_row(number)], model.profile.gamma)
+        peak = decode_scale(model.peak[model.row(number)], model.profile.gamma)
     return float(peak[before] if share == 0 else max(peak[before], peak[after]))
 
 
@@ -88,35 +88,27 @@ def _constant(model: SheetModel, number: int, time: float) -> np.ndarray:
     return (1.0 - share) * rows[before] + share * rows[after]
 
 
-def _network_output(model: SheetModel, number: int, place: int, time: float) -> np.ndarray:
+def _network_output(model: SheetModel, row: int, time: float) -> np.ndarray:
     """Returns the output of a tile's network at one time, normalised colour [128, 128, 3]."""
-    profile = model.profile
-    dynamic = model.kind[number] == TileKind.DYNAMIC
-    row = model.row(number)
-    maps = [decode_image(model.uv[place]) / 255.0]
-    if dynamic:
-        periodic = model.axis.periodic
-        tau = model.axis.place(time)
-        centres = (np.arange(TILE) + 0.5) / TILE
-        slices = decode_image(model.uvt[row]) / 255.0  # [S, R, R, 4]
-        volume = _along(slices, np.array([tau]), periodic)[0]
-        volume = _along(_along(volume, centres).swapaxes(0, 1), centres).swapaxes(0, 1)
-        maps.append(volume)
-        for plane, shape in ((model.ut, (1, TILE, 2)), (model.vt, (TILE, 1, 2))):
-            line = _along(_along(plane[row] / 255.0, np.array([tau]), periodic)[0], centres)
-            maps.append(np.broadcast_to(line.reshape(shape), (TILE, TILE, 2)))
+    profile, periodic, tau = model.profile, model.axis.periodic, model.axis.place(time)
+    centres = (np.arange(TILE) + 0.5) / TILE
+    slices = decode_image(model.uvt[row]) / 255.0  # [S, R, R, 4]
+    volume = _along(slices, np.array([tau]), periodic)[0]
+    volume = _along(_along(volume, centres).swapaxes(0, 1), centres).swapaxes(0, 1)
+    maps = [decode_image(model.uv[row]) / 255.0, volume]
+    for plane, shape in ((model.ut, (1, TILE, 2)), (model.vt, (TILE, 1, 2))):
+        line = _along(_along(plane[row] / 255.0, np.array([tau]), periodic)[0], centres)
+        maps.append(np.broadcast_to(line.reshape(shape), (TILE, TILE, 2)))
     features = (np.concatenate(maps, axis=2) - 0.5) * math.sqrt(12.0)  # mean 0 and deviation 1 if they are uniform
-    if dynamic:
-        turn = (2.0 if model.axis.periodic else 1.0) * math.pi * model.axis.place(time)
-        encoded = [math.sin(turn), math.cos(turn), math.sin(2.0 * turn), math.cos(2.0 * turn)]
-        features = np.concatenate([features, np.broadcast_to(encoded, (TILE, TILE, 4))], axis=2)
+    turn = (2.0 if periodic else 1.0) * math.pi * tau
+    encoded = [math.sin(turn), math.cos(turn), math.sin(2.0 * turn), math.cos(2.0 * turn)]
+    features = np.concatenate([features, np.broadcast_to(encoded, (TILE, TILE, 4))], axis=2)
 
-    width, inputs = profile.hidden, profile.inputs(bool(dynamic))
-    net = (model.net if dynamic else model.net_static)[row].astype(np.float64)
-    split = (inputs + width + 2) * width
+    width, net = profile.hidden, model.net[row].astype(np.float64)
+    split = (16 + width + 2) * width
     hidden, output = net[:split].reshape(-1, width), net[split:].reshape(-1, 3)
-    x = _gelu(features @ hidden[:inputs] + hidden[inputs], profile.gelu)
-    x = _gelu(x @ hidden[inputs + 1 : -1] + hidden[-1], profile.gelu)
+    x = _gelu(features @ hidden[:16] + hidden[16], profile.gelu)
+    x = _gelu(x @ hidden[17:-1] + hidden[-1], profile.gelu)
     return x @ output[:-1] + output[-1]
 
 

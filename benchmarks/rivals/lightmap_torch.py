@@ -20,7 +20,7 @@ from wlm.formats.hdr_blocks import need
 from wlm.lightmap.data import SheetFrames
 from wlm.lightmap.fit import Batch, SheetFit
 from wlm.lightmap.profile import Profile, TimeAxis, encode_time
-from wlm.lightmap.tiles import TILE, TileKind
+from wlm.lightmap.tiles import TILE
 from wlm.lightmap.trainer import Targets
 
 _BLOCK = 4  # texels along a BC7 block's side
@@ -33,8 +33,8 @@ _LEAST = 0.02  # smallest colour, over its scale, that weights an error: it keep
 def dynamic_targets(lightmaps: SheetFrames, profile: Profile) -> Targets | None:
     """Returns the training data of the dynamic tiles of a sheet, for use by other trainers; None without such tiles."""
     fit = SheetFit(lightmaps, profile)
-    rows = np.flatnonzero(fit.kinds == TileKind.DYNAMIC)
-    return fit.job(Batch(0, TileKind.DYNAMIC, rows, 0, fit)).targets() if len(rows) else None
+    rows = range(len(fit.model.uv))
+    return fit.job(Batch(0, rows, fit)).targets() if rows else None
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import warp as wp
 from wlm.formats.shared_exponent import unpack_rgb9e5
 from wlm.lightmap.encodings.constant import ConstantTiles
 from wlm.lightmap.model import SheetModel
-from wlm.lightmap.runtime import ExactDecoder, FrameDecoder, RuntimeDecoder, fast_decoder
+from wlm.lightmap.runtime import FrameDecoder, RuntimeDecoder, fast_decoder
 from wlm.lightmap.tiles import TILE, TileKind
 from wlm.texels import near_gaps
 from wlm_kernels.shared_exponent import pack_rgb9e5 as pack_kernel
@@ -153,8 +153,6 @@ def _tile_decoders(model: SheetModel, device: str) -> list[RuntimeDecoder]:
     decoders: list[RuntimeDecoder] = []
     if (model.kind == TileKind.DYNAMIC).any():
         decoders.append(fast_decoder(model, device, shared=True))
-    if (model.kind == TileKind.STATIC).any():
-        decoders.append(ExactDecoder(model, device, kind=TileKind.STATIC, shared=True))
     if (model.kind == TileKind.FRAMES).any():
         decoders.append(FrameDecoder(model, device, shared=True))
     return decoders

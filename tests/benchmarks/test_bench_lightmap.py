@@ -14,7 +14,7 @@ RIVALS = ("bc6h", "bc7", "astc12", "pca-bc4-2", "av1-75")
 
 @pytest.fixture(scope="module")
 def lightmaps():
-    """A dynamic tile, a static one and a constant one, 24 rows of each past the map's end."""
+    """Two dynamic tiles and a constant one, 24 rows of each past the map's end."""
     y, x = np.mgrid[:104, :384] / 64.0
     frames = np.zeros((4, 104, 384, 3))
     for i, t in enumerate(TIMES):

@@ -51,8 +51,7 @@ def _written(write: Callable[[Path], Any]) -> bytes:
 
 
 def _lightmap() -> Kept:
-    ranges = {"0.kind": (2, 7), "times": (3, 24.5), "0.constant": (0, -1.0), "0.scale_static": (0, -0.5)}
-    ranges |= {"0.affine": (0, -1.0)}
+    ranges = {"0.kind": (2, 7), "times": (3, 24.5), "0.constant": (0, -1.0), "0.affine": (0, -1.0)}
     return Kept(_written(synthetic.random_model(uvt_slices=1).save), wlm.load, {}, ranges)
 
 
@@ -63,12 +62,12 @@ def _frames() -> Kept:
 
 def _layers() -> Kept:
     ranges = {"0.kind": (0, 7), "times": (3, 24.5), "2.constant": (0, -1.0), "1.ranges": ((0, 0, 0), 3.0)}
-    return Kept(_written(random_layers(uvt_slices=1).save), wlm.load, {"0.mask": "missing"}, ranges)
+    return Kept(_written(random_layers(uvt_slices=1).save), wlm.load, {"0.mask": "missing size"}, ranges)
 
 
 def _groups() -> Kept:
     ranges = {"0.kind": (0, 7), "1.times": (0, 24.5), "0.constant": (0, -1.0), "1.ranges": ((0, 0, 0), 3.0)}
-    return Kept(_written(few_texels().save), wlm.load, {"0.mask": "missing"}, ranges)
+    return Kept(_written(few_texels().save), wlm.load, {"0.mask": "missing size"}, ranges)
 
 
 def _atlas(kind: str, colour: str) -> Kept:
@@ -94,7 +93,7 @@ def lightmap_fit() -> tuple[Any, Any]:
     """A fit of one dynamic tile, and a trainer of it after three steps."""
     fit = SheetFit(moving_light(40, 24).light, tiny_profile())
     (batch,) = fit.batches(0)
-    trainer = lightmap_trainer.Trainer(fit.model.profile, fit.model.axis, fit.job(batch).targets(), True, 0, "cpu")
+    trainer = lightmap_trainer.Trainer(fit.model.profile, fit.model.axis, fit.job(batch).targets(), 0, "cpu")
     trainer.run(3)
     return fit, trainer
 

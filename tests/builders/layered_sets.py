@@ -29,7 +29,7 @@ def random_layers(**settings) -> LightmapModel:
         random_sheet((3,), 1, seed=1, mask=mask, **settings),
         random_sheet((4,), 1, seed=2, mask=mask, **linear, **settings),
         random_sheet((1,), 1, seed=3, mask=mask, **linear, **settings),
-        random_sheet((2, 0), 2, seed=4, **settings),
+        random_sheet((3, 0), 2, seed=4, **settings),
     ]
     for model in models[1:]:
         model.mask = mask if model.mask.shape == mask.shape else model.mask

@@ -23,9 +23,9 @@ DARK = "unlit"
 def random_groups(mask: np.ndarray | None = None) -> LightmapModel:
     """A model of random maps of four tiles: every kind of tile meets every other, and groups have their own times."""
     sheets = {
-        "sky": random_sheet((3, 2, 3, 0), seed=1, mask=mask),
-        "sun": random_sheet((1, 4, 3, 2), times=(6.0, 12.5, 18.0), seed=2, mask=mask),
-        "lamp": random_sheet((4, 2, 0, 1), times=(0.0,), seed=3, mask=mask),
+        "sky": random_sheet((3, 3, 3, 0), seed=1, mask=mask),
+        "sun": random_sheet((1, 4, 3, 3), times=(6.0, 12.5, 18.0), seed=2, mask=mask),
+        "lamp": random_sheet((4, 3, 0, 1), times=(0.0,), seed=3, mask=mask),
         DARK: random_sheet((1, 1, 1, 0), times=(0.0,), seed=4, mask=mask),
     }
     sheets[DARK].constant[:] = 0.0

@@ -19,7 +19,7 @@ def tiny_profile(**settings) -> Profile:
 
 
 def moving_light(height=128, width=128, hours=HOURS, period=24.0, mask=None, seed=0, gain=1.0) -> LightmapSet:
-    """A spot that moves with the hour over a rough wall, so that no tile is static."""
+    """A spot that moves with the hour over a rough wall."""
     v, u = np.mgrid[:height, :width] / 128.0
     wall = np.random.default_rng(seed).uniform(0.6, 1.0, (height, width, 3))
     frames = []
@@ -30,18 +30,10 @@ def moving_light(height=128, width=128, hours=HOURS, period=24.0, mask=None, see
     return from_arrays(np.stack(frames), hours, mask, period, name="moving")
 
 
-def static_light(height=128, width=128, hours=HOURS, period=24.0) -> LightmapSet:
-    """Makes a pattern whose brightness alone changes with the hour."""
-    pattern = np.random.default_rng(1).uniform(0.1, 1.0, (height, width, 3))
-    frames = np.stack([pattern * (1.0 + hour) for hour in hours])
-    return from_arrays(frames, hours, period=period, name="static")
-
-
 def four_tiles(holes: np.ndarray | None = None) -> LightmapSet:
-    """Makes a dynamic, a static, a constant and an empty tile; `holes`, bool [256, 256], are outside the mask too."""
+    """Makes two dynamic tiles, a constant and an empty one; `holes`, bool [256, 256], are outside the mask too."""
     frames = np.zeros((5, 256, 256, 3), np.float32)
-    frames[:, :128, :128] = moving_light().light.frames
-    frames[:, :128, 128:] = static_light().light.frames / 24.0
+    frames[:, :128] = moving_light(128, 256).light.frames
     frames[:, 128:, :128] = (1.0 + np.arange(5.0))[:, None, None, None] / 5.0
     mask = np.ones((256, 256), bool)
     mask[128:, 128:] = False

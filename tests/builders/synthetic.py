@@ -17,15 +17,16 @@ def random_model(*args, **options) -> LightmapModel:
 
 
 def random_sheet(
-    kinds=(3, 2, 1, 0), columns=2, times=(0.0, 7.5, 13.0, 19.0), period=24.0, seed=0, mask=None, **settings
+    kinds=(3, 3, 1, 0), columns=2, times=(0.0, 7.5, 13.0, 19.0), period=24.0, seed=0, mask=None, **settings
 ) -> SheetModel:
     """Makes a sheet with tiles of these kinds, `columns` in a row; without a `mask` it has no gaps."""
     rng = np.random.default_rng(seed)
-    profile = Profile(name="random", **{"hidden": 8, "uvt_resolution": 8, "uvt_slices": 3} | settings)
+    sizes = {"hidden": 8, "uvt_resolution": 8, "uvt_slices": 3}
+    profile = Profile(name="random", **sizes | settings).for_times(len(times))
     kind = np.array(kinds, np.uint8)
     rows = len(kind) // columns
-    dynamic, static, constant = (int((kind == k).sum()) for k in (3, 2, 1))
-    mapped, r = dynamic + static, profile.uvt_resolution // 4
+    dynamic, constant = (int((kind == k).sum()) for k in (3, 1))
+    r = profile.uvt_resolution // 4
     # The map ends inside its last row and column of tiles.
     height, width = rows * 128 - 20, columns * 128 - 9
     assert TileGrid.of(height, width).count == len(kind) and max(kinds) <= max(TileKind)
@@ -35,12 +36,9 @@ def random_sheet(
         ends = (rng.integers(0, 128, (*shape, 2, 4)) * 2 + lowest).astype(np.uint8)
         return pack_mode6(ends, rng.integers(0, 16, (*shape, 16), np.uint8))
 
-    def nets(count, temporal):
-        parameters = mlp.parameter_count(profile.inputs(temporal), profile.hidden)
-        return (rng.standard_normal((count, parameters)) * profile.hidden**-0.5).astype(np.float16)
-
     plane = (dynamic, profile.plane_rows, profile.plane_columns, 2)
-    affine = np.stack([rng.uniform(0.8, 1.2, (mapped, 3)), rng.uniform(0.1, 0.3, (mapped, 3))], axis=1)
+    affine = np.stack([rng.uniform(0.8, 1.2, (dynamic, 3)), rng.uniform(0.1, 0.3, (dynamic, 3))], axis=1)
+    net = rng.standard_normal((dynamic, mlp.parameter_count(16, profile.hidden))) * profile.hidden**-0.5
     # A channel's code 0 is black at that time; the bound, 255, is far above every mean.
     scale = rng.integers(86, 161, (dynamic, len(times), 3), np.uint8)
     scale[:1, -1, 2] = 0
@@ -57,15 +55,13 @@ def random_sheet(
         profile=profile,
         mask=mask,
         kind=kind,
-        uv=blocks(mapped, 32, 32),
+        uv=blocks(dynamic, 32, 32),
         uvt=blocks(dynamic, profile.uvt_slices, r, r),
         ut=rng.integers(0, 256, plane, np.uint8),
         vt=rng.integers(0, 256, plane, np.uint8),
-        net=nets(dynamic, True),
-        net_static=nets(static, False),
+        net=net.astype(np.float16),
         scale=scale,
-        scale_static=rng.uniform(0.05, 2.0, (static, len(times), 3)).astype(np.float16),
-        peak=rng.integers(161, 191, (mapped, len(times)), np.uint8),
+        peak=rng.integers(161, 191, (dynamic, len(times)), np.uint8),
         affine=affine.astype(np.float16),
         constant=rng.uniform(0.0, 3.0, (constant, len(times), 3)).astype(np.float16),
         frames=frames,

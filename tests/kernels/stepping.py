@@ -20,7 +20,6 @@ class Case:
     """The settings and targets of a trainer.
 
     Attributes:
-        temporal: Whether the tiles have temporal maps.
         hidden, gelu, samples: As in `Profile`.
         shape: Resolution and slices of F_uvt, columns and rows of the planes.
         periodic: A periodic axis of evenly spaced frames, or a clamped one from 0 to 1 in uneven steps.
@@ -30,7 +29,6 @@ class Case:
         settings: Other fields of `Profile`.
     """
 
-    temporal: bool = True
     hidden: int = 16
     gelu: str = "tanh"
     samples: int = 256
@@ -85,7 +83,7 @@ class Case:
 
 def trainer(case: Case, device: str, seed: int = 3, spread: bool = True) -> Trainer:
     """A trainer; with `spread` its maps and networks are random with values out of range, not the initial ones."""
-    result = Trainer(case.profile(), case.axis(), case.targets(), case.temporal, seed, device)
+    result = Trainer(case.profile(), case.axis(), case.targets(), seed, device)
     if spread:
         for key, values in _clear_values(result).items():
             result.views[key].copy_(torch.from_numpy(values))
@@ -118,7 +116,7 @@ def _clear_values(trainer: Trainer) -> dict[str, np.ndarray]:
 
 
 def draw(trainer: Trainer, quantised: bool) -> tuple[np.ndarray, np.ndarray]:
-    """The samples of the coming step: places int [N, B, 3] as (y, x, time) and features float32 [N, B, I]."""
+    """The samples of the coming step: places int [N, B, 3] as (y, x, time) and features float32 [N, B, 16]."""
     kernels, samples = trainer._kernels, trainer._samples
     shape = (trainer.tiles, samples)
     with interop.stream(trainer.device):
@@ -180,7 +178,7 @@ class Problem:
     hidden: torch.Tensor
     output: torch.Tensor
     place: torch.Tensor  # [N, B, 3]
-    noise: torch.Tensor  # [N, B, I]
+    noise: torch.Tensor  # [N, B, 16]
     tau: torch.Tensor  # [N, B]
     encoding: torch.Tensor  # [N, B, 4]
     target: torch.Tensor  # [N, B, 3]
@@ -195,7 +193,7 @@ class Problem:
         return torch.arange(len(self.place)).repeat_interleave(self.place.shape[1])
 
     def features(self) -> torch.Tensor:
-        """The network's inputs, centred and with the noise, [N, B, I]."""
+        """The network's inputs, centred and with the noise, [N, B, 16]."""
         flat = self.place.reshape(-1, 3)
         features = reference.train_features(
             self.maps,

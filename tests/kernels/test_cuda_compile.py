@@ -117,8 +117,8 @@ def _cases(name: str, build: Callable, quick: list[tuple], *axes: tuple) -> Iter
 
 FACTORIES = [
     *_cases("mlp", lambda *of: mlp.kernels(16, *of), [], WIDTHS, ("fast", "exact", "tanh"), (3, 5)),
-    *_cases("step", lambda *of: lightmap_step.step_kernels(*of, "cuda"), [], BOTH, (16, 64), ("tanh", "exact")),
-    *_cases("exact_decode", lambda *of: list(lightmap_decode.exact_kernels(*of, "tanh")), [], BOTH, WIDTHS),
+    *_cases("step", lambda *of: lightmap_step.step_kernels(*of, "cuda"), [], (16, 64), ("tanh", "exact")),
+    *_cases("exact_decode", lambda width: list(lightmap_decode.exact_kernels(width, "tanh")), [], WIDTHS),
     *_cases("matrix_decode", matrix_decode.matrix_kernels, [(16, 32, True)], (16, 48, 64), (4, 32, 128), BOTH),
     *_cases("frames", lambda: list(FRAMES), []),
     *_cases("pages", lambda *of: [pages.page_kernel(*of)], [], (8, 16, 64), ("fast", "exact")),

@@ -12,13 +12,12 @@ from benchmarks.lightmap_exact import decode_tile64
 from kernels.compare import array, close
 from kernels.stepping import Case, draw, trainer
 from wlm.lightmap.decode import SheetDecoder
-from wlm.lightmap.encodings.maps import MapTiles
+from wlm.lightmap.encodings.maps import MapTiles, split_networks
 from wlm.lightmap.model import SheetModel
 from wlm.lightmap.runtime import ExactDecoder
-from wlm.lightmap.tiles import TileKind
 from wlm_kernels.lightmap.matrix_decode import pack_networks
 
-KINDS = (3, 2, 3, 1)  # dynamic, static, dynamic, constant
+KINDS = (3, 3, 3, 1)
 BETWEEN = 21.7  # between the last stored time and the next day's first
 
 
@@ -79,11 +78,8 @@ def test_networks_packed_for_matrix_units(width: int):
 def _stored(fit, case: Case) -> SheetModel:
     """A trainer's tiles as the file holds them, with random scales."""
     parts, n = fit.quantised(), fit.tiles
-    kind = TileKind.DYNAMIC if case.temporal else TileKind.STATIC
-    base = random_sheet([int(kind)] * n, columns=n, times=tuple(fit.axis.times), hidden=case.hidden)
+    base = random_sheet([3] * n, columns=n, times=tuple(fit.axis.times), hidden=case.hidden)
     random = np.random.default_rng(1)
-    if not case.temporal:
-        parts["net_static"] = parts.pop("net")
     return dataclasses.replace(
         base,
         profile=case.profile(),
@@ -94,29 +90,25 @@ def _stored(fit, case: Case) -> SheetModel:
     )
 
 
-@pytest.mark.parametrize("temporal", [True, False], ids=["dynamic", "static"])
 @pytest.mark.parametrize("periodic", [True, False], ids=["periodic", "clamped"])
-def test_file_is_what_was_trained(device: str, temporal: bool, periodic: bool):
+def test_file_is_what_was_trained(device: str, periodic: bool):
     """The features of quantised training through the rounded network give the codes that the file decodes to.
 
     Bit for bit on the CPU; a GPU's compiler may contract the same operations differently in two kernels.
     """
-    case = Case(temporal=temporal, periodic=periodic, samples=8192)
+    case = Case(periodic=periodic, samples=8192)
     fit = trainer(case, device)
     fit.run(6)
     model = _stored(fit, case)
     place, features = draw(fit, True)
     net = fit._kernels.net
-    split = (fit.inputs + case.hidden + 2) * case.hidden
-    half = (model.net if temporal else model.net_static).astype(np.float32)
-    hidden = array(half[:, :split].reshape(fit.tiles, -1, case.hidden), net.vec_hidden, device)
-    output = array(half[:, split:].reshape(fit.tiles, -1, 3), wp.vec3, device)
+    half = split_networks(model.net.astype(np.float32), case.hidden)
+    hidden, output = array(half[0], net.vec_hidden, device), array(half[1], wp.vec3, device)
     answer = wp.zeros(place.shape[:2], dtype=wp.vec3, device=device)
     net.forward(hidden, output, array(features, net.vec_in, device), answer)
     y = answer.numpy()
 
-    kind = TileKind.DYNAMIC if temporal else TileKind.STATIC
-    exact, tiles = ExactDecoder(model, device, kind=kind), MapTiles(model, kind, device, case.gelu)
+    exact, tiles = ExactDecoder(model, device), MapTiles(model, device, case.gelu)
     wrong = total = 0
     levels = set()
     for k, time in enumerate(model.times):

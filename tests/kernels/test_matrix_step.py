@@ -31,13 +31,12 @@ def _hold(pair: tuple[Trainer, Trainer], quantised: bool) -> None:
 
 
 @pytest.mark.parametrize("quantised", [False, True], ids=["continuous", "quantised"])
-@pytest.mark.parametrize("temporal", [True, False], ids=["dynamic", "static"])
 @pytest.mark.parametrize("hidden", WIDTHS)
-def test_loss_and_gradients(hidden: int, temporal: bool, quantised: bool):
+def test_loss_and_gradients(hidden: int, quantised: bool):
     """Many blocks of samples, every width, both GELUs, a network on levels."""
     gelu = "tanh" if hidden in (16, 64) else "exact"
     settings = {"net_bits": 8 if hidden == 64 else 16}
-    case = Case(temporal=temporal, hidden=hidden, gelu=gelu, samples=2048, emphasis=0.7, settings=settings)
+    case = Case(hidden=hidden, gelu=gelu, samples=2048, emphasis=0.7, settings=settings)
     pair = _pair(case)
     _hold(pair, quantised)
 

@@ -22,7 +22,7 @@ VARIANTS = {
     "periodic": {"periodic": True},
     "clamped-weighted": {"periodic": False, "emphasis": 1.2},
     "one-cell": {"shape": (4, 1, 1, 1), "emphasis": -0.5},
-    "static": {"temporal": False, "emphasis": 0.7, "texels": (5000, 3)},
+    "three-texels": {"emphasis": 0.7, "texels": (5000, 3)},
 }
 
 
@@ -43,7 +43,7 @@ def _hold(fit: Trainer, twin: Problem) -> None:
 @pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize("hidden", WIDTHS)
 def test_a_step(device: str, hidden: int, variant: str, quantised: bool):
-    """Loss, maps and network, against autograd; of static tiles, too, of which one has three valid texels."""
+    """Loss, maps and network, against autograd; also of a tile with three valid texels."""
     case = Case(hidden=hidden, **VARIANTS[variant])
     fit = _trainer(case, device)
     twin = problem(fit, case, quantised)

@@ -27,7 +27,7 @@ AXES = [
     {"interpolation": "network"},
     {"time_axis": "paper", "period": None, "times": (2.0, 7.5, 20.0), "interpolation": "network"},
     {"kinds": (4, 3, 4, 4)},
-    {"kinds": (4, 2, 1, 4), "interpolation": "network", "period": None},
+    {"kinds": (4, 3, 1, 4), "interpolation": "network", "period": None},
 ]
 
 
@@ -72,20 +72,19 @@ def linear(values, at, repeats):
 def features(folder, document, tile, tau, repeats):
     image = tile["image"]
     parts = [image_of(folder, document, "uv", image)]
-    if tile["kind"] == "dynamic":
-        at = (np.arange(128) + 0.5) / 128.0
-        slices = document["slices"]
-        stack = np.stack([image_of(folder, document, "uvt", image * slices + i) for i in range(slices)])
-        volume = linear(stack, tau, repeats)
-        rows = np.stack([linear(volume, v, False) for v in at])
-        parts.append(np.stack([linear(rows.swapaxes(0, 1), u, False) for u in at], axis=1))
-        for i, shape in enumerate(((1, 128, 2), (128, 1, 2))):
-            line = linear(image_of(folder, document, "planes", 2 * image + i), tau, repeats)
-            line = np.stack([linear(line, p, False) for p in at])
-            parts.append(np.broadcast_to(line.reshape(shape), (128, 128, 2)))
-        turn = document["time_axis"]["turn"] * tau
-        encoded = [np.sin(turn), np.cos(turn), np.sin(2 * turn), np.cos(2 * turn)]
-        parts.append(np.broadcast_to(encoded, (128, 128, 4)))
+    at = (np.arange(128) + 0.5) / 128.0
+    slices = document["slices"]
+    stack = np.stack([image_of(folder, document, "uvt", image * slices + i) for i in range(slices)])
+    volume = linear(stack, tau, repeats)
+    rows = np.stack([linear(volume, v, False) for v in at])
+    parts.append(np.stack([linear(rows.swapaxes(0, 1), u, False) for u in at], axis=1))
+    for i, shape in enumerate(((1, 128, 2), (128, 1, 2))):
+        line = linear(image_of(folder, document, "planes", 2 * image + i), tau, repeats)
+        line = np.stack([linear(line, p, False) for p in at])
+        parts.append(np.broadcast_to(line.reshape(shape), (128, 128, 2)))
+    turn = document["time_axis"]["turn"] * tau
+    encoded = [np.sin(turn), np.cos(turn), np.sin(2 * turn), np.cos(2 * turn)]
+    parts.append(np.broadcast_to(encoded, (128, 128, 4)))
     return np.concatenate(parts, axis=2)
 
 
@@ -93,8 +92,7 @@ def layers_of(folder, document, tile):
     """W1, b1, W2, b2, W3 and b3 of a tile, with their zeros."""
     numbers = np.fromfile(folder / "networks.bin", "<f4").reshape(-1, 4).astype(np.float64)
     wide, at = -(-document["hidden"] // 4), tile["network_four"]
-    inputs = 16 if tile["kind"] == "dynamic" else 4
-    for rows, fours in ((inputs, wide), (1, wide), (4 * wide, wide), (1, wide), (4 * wide, 1), (1, 1)):
+    for rows, fours in ((16, wide), (1, wide), (4 * wide, wide), (1, wide), (4 * wide, 1), (1, 1)):
         yield numbers[at : at + rows * fours].reshape(rows, 4 * fours)
         at += rows * fours
 
@@ -166,10 +164,10 @@ def test_a_texture_beyond_a_gpu():
 
 
 def test_what_cannot_be_exported():
-    sheet = random_sheet((2, 0))
-    net = sheet.net_static.copy()
+    sheet = random_sheet((3, 0))
+    net = sheet.net.copy()
     net[0, 5] = np.inf
-    assert "a weight is NaN or infinite" in error_of(file_of(replace(sheet, net_static=net)).bundle)
+    assert "a weight is NaN or infinite" in error_of(file_of(replace(sheet, net=net)).bundle)
     assert "device 'tpu'" in error_of(file_of(sheet).bundle, device="tpu")
 
 
@@ -184,7 +182,7 @@ void main()
 
 
 @pytest.mark.parametrize("exact", ["", "#define WLM_LIGHTMAP_EXACT\n"])
-@pytest.mark.parametrize("settings", [{"gelu": "exact"}, {"kinds": (4, 3, 1, 4)}, {"kinds": (2, 1, 0, 2)}], ids=str)
+@pytest.mark.parametrize("settings", [{"gelu": "exact"}, {"kinds": (4, 3, 1, 4)}], ids=str)
 def test_the_shader_compiles(settings, exact, tmp_path):
     model = random_sheet(**settings)
     names = [f"#define WLM_LIGHTMAP_{name.upper()}_BINDING {i}\n" for i, name in enumerate(texture_names(model))]
@@ -216,7 +214,7 @@ def test_the_shader_gives_the_decoders_light(settings, tmp_path):
 @pytest.mark.parametrize("time", TIMES[1:])
 def test_a_table_between_two_hours(time, tmp_path):
     """Networks that interpolate, with frames, which do not."""
-    model = random_sheet((3, 4, 1, 2), interpolation="network")
+    model = random_sheet((3, 4, 1, 3), interpolation="network")
     expected = SheetDecoder(model).frame(time)
     export(file_of(model), tmp_path)
     uniforms, _ = lightmap_uniforms(tmp_path)

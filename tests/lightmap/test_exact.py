@@ -10,7 +10,7 @@ import pytest
 from builders.checks import error_of
 from builders.lightmap_codes import codes_at, shares_of
 from builders.resigned import error_of_changed
-from builders.small_sets import moving_light, static_light, tiny_profile
+from builders.small_sets import moving_light, tiny_profile
 from builders.synthetic import any_blocks, random_model, random_sheet
 
 import wlm
@@ -48,8 +48,7 @@ TIMES = (0.0, 7.5, 10.0, 21.7)
 def test_the_decoder_agrees(settings, device):
     model = random_sheet(**settings)
     decoder = SheetDecoder(model, device)
-    maps = [kind for kind in (TileKind.STATIC, TileKind.DYNAMIC) if kind in model.kind]
-    runtimes = [ExactDecoder(model, device, kind=kind) for kind in maps]
+    runtimes = [ExactDecoder(model, device)]
     runtimes += [FrameDecoder(model, device) for _ in model.numbers(TileKind.FRAMES)[:1]]
     for time in TIMES:
         tiles = decoder.tiles(range(4), time)
@@ -60,7 +59,7 @@ def test_the_decoder_agrees(settings, device):
             colour = colour_tile64(model, number, time)
             np.testing.assert_allclose(colour**2.2, expected, rtol=1e-9, atol=1e-12)
         # Between two times that are decoded apart, what a bound cuts off before the mix is another matter.
-        for runtime in runtimes[len(model.axis.reads(time)) == 2 and len(maps) :]:
+        for runtime in runtimes[len(model.axis.reads(time)) == 2 :]:
             codes, most = codes_at(runtime, time), 0.51 if time in model.times else 1.51
             np.testing.assert_allclose(
                 runtime.bounds, [bound64(model, number, time) for number in runtime.numbers], rtol=1e-6
@@ -131,25 +130,24 @@ def test_two_states_are_as_good_as_bc7_in_as_many_bytes(two_hours, tmp_path):
         (moving_light(hours=(6.0, 12.0, 18.0)), {}, "dynamic"),
         (moving_light(hours=(6.0, 12.0, 18.0)), {"uvt_resolution": 64}, "frames"),
         (moving_light(hours=(6.0,)), {}, "frames"),
-        (static_light(hours=(6.0, 12.0)), {}, "static"),
-        (moving_light(hours=(6.0,)), {"frames": "never"}, "static"),
-        (static_light(hours=(6.0, 12.0)), {"frames": "always"}, "frames"),
+        (moving_light(hours=(6.0,)), {"frames": "never"}, "dynamic"),
+        (moving_light(hours=(6.0, 12.0, 18.0)), {"frames": "always"}, "frames"),
     ],
-    ids=["two", "three", "large maps", "one", "static", "never", "always"],
+    ids=["two", "three", "large maps", "one", "never", "always"],
 )
 def test_a_tile_is_frames_where_that_takes_no_more(lightmaps, settings, kind):
     profile, count = Profile.load("M").override(settings), len(lightmaps.times)
     kinds = classify(split(lightmaps.light, profile.gamma), profile.gamma)
     chosen = choose_frames(kinds, count, profile)
     assert ("frames" if chosen[0] else TileKind(kinds[0]).name.lower()) == kind
-    assert "frames" in settings or chosen[0] == (count * 16384 < tile_bytes(profile, kinds[0] == TileKind.DYNAMIC))
+    assert "frames" in settings or chosen[0] == (count * 16384 < tile_bytes(profile))
 
 
 def test_without_the_encoder_a_network_is_fitted_and_that_is_said(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "ispc_texcomp", None)
     lightmaps = moving_light(hours=(6.0,))
     model = compress(lightmaps, tiny_profile(frames="auto"))
-    assert count_kinds(model.sheets[LIGHT])["static"] == 1
+    assert count_kinds(model.sheets[LIGHT])["dynamic"] == 1
     assert len(model.warnings) == 1 and "1 tile would take" in model.warnings[0]
     assert "pip install 'wlm[frames]'" in model.warnings[0] and "\n" not in model.warnings[0]
     with pytest.raises(WlmError, match=r"^frames: ispc_texcomp is missing; needs the extra"):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 from builders.kept_files import lightmap_fit
-from builders.small_sets import HOURS, moving_light, static_light, tiny_profile
+from builders.small_sets import HOURS, moving_light, tiny_profile
 
 import wlm
 from wlm.errors import WlmError
@@ -69,18 +69,6 @@ def test_a_fit_that_diverged_keeps_nothing():
             trainer.hidden[0, 2, 1] = kept
 
 
-def test_a_static_tile_stores_no_temporal_maps_and_follows_the_brightness(tmp_path):
-    lightmaps = static_light()
-    decoder = through_file(tmp_path, lightmaps, tiny_profile(steps=60))
-    model = decoder.model
-    assert only(decoder, "static")
-    assert model.uvt.size == model.ut.size == model.vt.size == model.net.size == 0
-    out = decoded(decoder)
-    np.testing.assert_allclose(out.mean((1, 2)), lightmaps.light.frames.mean((1, 2)), rtol=0.1)
-    # One pattern: any two times differ by a factor alone.
-    np.testing.assert_allclose(out[3] / out[3].mean((0, 1)), out[1] / out[1].mean((0, 1)), rtol=1e-3, atol=1e-4)
-
-
 def test_one_valid_texel(tmp_path):
     mask = np.zeros((128, 128), bool)
     mask[77, 3] = True
@@ -93,10 +81,11 @@ def test_one_valid_texel(tmp_path):
     assert report.light.scored == 0 and report.to_json()["psnr"] is None
 
 
-def test_one_time_only_is_static_and_the_same_at_any_hour(tmp_path):
+@pytest.mark.parametrize("frames", ["auto", "never"])
+def test_one_time_only_is_the_same_at_any_hour(tmp_path, frames):
     for period in (24.0, None):
-        decoder = through_file(tmp_path, moving_light(hours=(6.0,), period=period))
-        assert only(decoder, "static")
+        decoder = through_file(tmp_path, moving_light(hours=(6.0,), period=period), tiny_profile(frames=frames))
+        assert only(decoder, "frames" if frames == "auto" else "dynamic")
         for hour in (0.0, 6.0, 23.9, -5.0, 100.0):
             # Up to the rounding of (1 - share) x + share x.
             np.testing.assert_allclose(decoder.frame(hour), decoder.frame(6.0), rtol=1e-5)
@@ -109,7 +98,8 @@ def test_maps_follow_the_number_of_times(times, slices, rows):
     sized = Profile.load("standard").for_times(times)
     assert (sized.uvt_slices, sized.plane_rows) == (slices, rows)
     assert sized.for_times(times) == sized
-    assert Profile.load("M").for_times(times) == Profile.load("M")
+    paper = Profile.load("M").for_times(times)
+    assert (paper.uvt_slices, paper.plane_rows) == ((1, 1) if times == 1 else (12, 24))
 
 
 @pytest.mark.slow
@@ -187,9 +177,8 @@ def test_a_subset_of_the_tiles(tmp_path):
     assert not frame[:128, 128:].any() and not frame[128:, :128].any()
 
 
-@pytest.mark.parametrize("make", [moving_light, static_light])
-def test_a_tile_alone_is_the_tile_of_a_batch(make):
-    narrow, lightmaps = make(128, 128), make(128, 256)
+def test_a_tile_alone_is_the_tile_of_a_batch():
+    narrow, lightmaps = moving_light(128, 128), moving_light(128, 256)
     frames = lightmaps.light.frames.copy()
     frames[:, :, :128] = narrow.light.frames
     frames[:, :, 128:] = frames[:, :, 128:] * 0.01 + frames[:, :, :128].mean((1, 2))[:, None, None]
@@ -197,8 +186,7 @@ def test_a_tile_alone_is_the_tile_of_a_batch(make):
     batch = compress(lightmaps, PROFILE, seed=5).sheets[LIGHT]
     alone = compress(lightmaps, PROFILE, seed=5, tiles=[0]).sheets[LIGHT]
     assert len(batch.uv) == 2
-    for name in ("uv", "uvt", "ut", "vt", "net", "net_static", "scale", "scale_static", "peak", "affine"):
-        # A part that the tile hasn't is empty in both.
+    for name in ("uv", "uvt", "ut", "vt", "net", "scale", "peak", "affine"):
         np.testing.assert_array_equal(getattr(batch, name)[:1], getattr(alone, name)[:1], err_msg=name)
     np.testing.assert_array_equal(SheetDecoder(batch).tiles([0], 9.0), SheetDecoder(alone).tiles([0], 9.0))
 

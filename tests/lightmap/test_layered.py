@@ -106,7 +106,7 @@ def test_levels_of_8_bits_that_flicker_are_constant_and_others_are_not():
     layer = Layer(levels / 255.0, "dir", encoding="unit")
     model = wlm.lightmap.compress(from_layers([layer], [0.0]), tiny_profile())
     (own,) = model.sheets.values()
-    assert own.kind.tolist() == [TileKind.CONSTANT, TileKind.STATIC]
+    assert own.kind.tolist() == [TileKind.CONSTANT, TileKind.DYNAMIC]
     assert np.abs(model.decoder().frame(0.0)[:, :128] - 128.5 / 255.0).max() < 1e-3
 
 

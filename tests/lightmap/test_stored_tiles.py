@@ -20,7 +20,7 @@ from wlm.lightmap.loading import TileLoader
 from wlm.lightmap.model import PACKED
 from wlm.lightmap.sheet import LIGHT
 
-KINDS = (3, 2, 1, 0, 4, 3)
+KINDS = (3, 3, 1, 0, 4, 3)
 PACKED_TILES = [0, 1, 4, 5]
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from builders.running import report_always
-from builders.small_sets import moving_light, static_light, tiny_profile, write_set
+from builders.small_sets import moving_light, tiny_profile, write_set
 from builders.worker_pools import Several
 
 import wlm
@@ -32,10 +32,9 @@ PROFILE = tiny_profile(steps=40)
 
 @pytest.fixture
 def lightmaps(monkeypatch):
-    """Two static tiles beside four dynamic ones, each a batch of its own."""
+    """Six tiles, each a batch of its own."""
     monkeypatch.setattr(fit, "CPU_TILES", 1)
-    static, moving = static_light(256, 128).light, moving_light(256, 256).light
-    return from_arrays(np.concatenate([static.frames, moving.frames], axis=2), moving.times, period=24.0)
+    return moving_light(256, 384)
 
 
 def bytes_of(model, folder):

@@ -35,12 +35,10 @@ def train_features(
         quantised: Whether values are put on the levels of the file; gradients pass straight through.
 
     Returns:
-        [M, 16], or [M, 4] for static tiles.
+        [M, 16].
     """
     uv = plain.bc7_texels(maps["uv_endpoints"], maps["uv_weights"], quantised=quantised)
     found = uv[tile, place[:, 0], place[:, 1]]
-    if "uvt_weights" not in maps:
-        return found
     uvt = plain.bc7_texels(maps["uvt_endpoints"], maps["uvt_weights"], quantised=quantised)
     v, u = ((place.double() + 0.5) / SIZE).unbind(1)
     at = torch.stack([u, v, tau], 1)

@@ -42,17 +42,17 @@ _ABOUT = {
     "rule 'paper' with a period tau is t / period.",
     "hours": "The buffer hours has a table for each stored time, hour_fours times four floats, which the shader reads. "
     "Fours 0 and 1: for F_uvt, and for F_ut and F_vt, the slices or rows before and after tau, and the share of the "
-    "later one. Then record fours for each tile of the grid, in order: code (0 empty or constant, 1 static, 2 "
-    "dynamic, 3 frames), image, network_four, share of the later frame. Code 0: colour. 1 and 2: shift * scale, "
-    "spread * scale, then b1, which for code 2 includes the encoded time: b1 + its four rows of W1 times sin, "
-    "cos(turn * tau), sin, cos(2 turn * tau). 3: least and layer, greatest, of the earlier, then of the later frame. "
+    "later one. Then record fours for each tile of the grid, in order: code (0 empty, 1 constant, 3 dynamic, 4 "
+    "frames), image, network_four, share of the later frame. Code 1: colour. 3: shift * scale, spread * scale, then b1 "
+    "with the encoded time in it: b1 + its four rows of W1 times sin, cos(turn * tau), sin, cos(2 turn * tau). "
+    "4: least and layer, greatest, of the earlier, then of the later frame. "
     "Between two stored times, if interpolation is network, a table is computed in the same way.",
     "colour": "(shift + spread * y) * scale, not below 0, is the colour in gamma space; y is the output of the network "
     "(the shader). radiance = colour ** gamma, linear RGB. scale is interpolated linearly between stored times.",
     "peak": "An upper bound of the tile's colour in gamma space: the value of 255 if colour is kept in 8 bits. "
     "Between two stored times the larger one holds.",
     "network": "h1 = gelu(x W1 + b1), h2 = gelu(h1 W2 + b2), y = h2 W3 + b3, a row of W for each input. x is uv[4], "
-    "uvt[4], ut[2], vt[2] as sampled, in [0, 1], then the encoded time[4]; of a static tile only uv[4]. The buffer "
+    "uvt[4], ut[2], vt[2] as sampled, in [0, 1], then the encoded time[4]. The buffer "
     "networks has float32 W1 b1 W2 b2 W3 b3 of each tile, the rows filled up with zeros to fours, and rows of zeros "
     "added for those; a tile's begin at four network_four.",
     "radiance": "Linear RGB of a constant tile at each stored time, interpolated linearly.",
@@ -141,9 +141,8 @@ def hour_tables(model: SheetModel, times: Sequence[float]) -> np.ndarray:
             table[i, :3] = _between(tau, count, axis.periodic)
         table[0, 3] = model.grid.cols
     records = tables[:, HEAD:].reshape(len(times), -1, size, 4)
+    records[:, :, 0, 0] = model.kind
     for encoding in ENCODINGS:
-        for kind, code in zip(encoding.kinds, encoding.codes, strict=True):
-            records[:, model.kind == kind, 0, 0] = code
         encoding.fill_records(model, times, records)
     return tables
 

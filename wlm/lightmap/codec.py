@@ -31,6 +31,7 @@ from wlm.lightmap.tiles import TileGrid, TileKind
 from wlm.system import Header, Name
 from wlm.workers import each
 
+_STATIC = 2  # kind of tiles of one pattern for all times
 _TIMES = Part(np.float64, (None,))
 _BYTES = Part(np.uint8, (None,))
 _Word = Annotated[Name, Field(min_length=1, max_length=MOST_NAME)]
@@ -119,6 +120,8 @@ def decode(artifact: Artifact) -> LightmapModel:
                 times[sheet.group] = _read_times(arrays, header.period)
                 del parts[number]["times"]
             kind = check_part(arrays, "kind", Part(np.uint8, (count,), most=max(TileKind)))
+            if (kind == _STATIC).any():
+                raise ValueError("part kind: found a static tile of an earlier version: compress the input again")
             stamps = times[sheet.group]
             profiles.append(header.profile.for_times(len(stamps)).for_sheet(sheet))
             tables.append(part_table(profiles[-1], kind, len(stamps)))

@@ -48,7 +48,7 @@ class SheetReport(ShownScore, Summary):
         tiles: Number of tiles that are not empty.
         not_scored: Number of pairs that are not scored, by reason: `empty` (no valid texel), `not_held` (valid texels,
             but not in the file), `few_texels`, `zero_range` (see `wlm.metrics`).
-        kinds: Number of tiles of each kind: `empty`, `constant`, `static`, `dynamic`, `frames`.
+        kinds: Number of tiles of each kind: `empty`, `constant`, `dynamic`, `frames`.
         warnings: Lines about tiles that were not scored, and about lost light of few very bright texels.
         held_out: Scores at the times of the input that the model does not store; None if it stores all.
     """

@@ -32,6 +32,7 @@ CPU_TILES = 4
 
 _LOOK = 32  # tiles that are classified between two looks at the clock: some seconds
 _WORTHWHILE = 20_000_000  # samples that take two cores about 20 s: a process takes 3 s to start
+_FITTED = ("net", "uv", "uvt", "ut", "vt")  # arrays that a trainer returns
 _CONSTANT_ERROR = 0.01  # largest relative error of half floats of constant radiance; near 6e-8 they are further off
 
 Parts = dict[str, np.ndarray]
@@ -39,16 +40,11 @@ Parts = dict[str, np.ndarray]
 
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """Tiles of one sheet (three channels) and of one kind, STATIC or DYNAMIC, which are fitted together.
-
-    `rows`, int [n], are indices of the tiles in `SheetFit.index`; `first` is the number of tiles of the same kind in
-    earlier batches of the sheet. Batches are numbered from 0.
-    """
+    """Dynamic tiles of one sheet (three channels), which are fitted together; `rows` are theirs in the arrays of the
+    sheet's model. Batches are numbered from 0."""
 
     number: int
-    kind: TileKind
-    rows: np.ndarray
-    first: int
+    rows: range
     fit: "SheetFit"
 
 
@@ -106,7 +102,7 @@ def compress(
         samples = profile.steps * profile.samples * sum(len(batch.rows) for batch in batches)
         place = Place(workers=max(1, min(cores() // CPU_LANES, samples // _WORTHWHILE)))
     tasks = [
-        Task((each.number,), profile.steps, partial(each.fit.job, each), each.kind, each.fit.table(each))
+        Task((each.number,), profile.steps, partial(each.fit.job, each), "tiles", each.fit.table(each))
         for each in batches
     ]
     meter, worker = Meter(progress, "fit", profile.steps * len(batches)), (Fitter, seed, progress is not None)
@@ -170,9 +166,9 @@ class _Facts:
     """Numbers of one tile that the file stores beside its maps and network, rounded as in the file (section 4)."""
 
     kind: TileKind
-    scale: np.ndarray | None = None  # [T, 3] of tiles with maps: codes, of a static tile half floats
-    peak: np.ndarray | None = None  # uint8 [T] of tiles with maps, codes of the largest colour
-    affine: np.ndarray | None = None  # [2, 3] of tiles with maps, shift and spread
+    scale: np.ndarray | None = None  # uint8 [T, 3] of a dynamic tile, codes of the channel means
+    peak: np.ndarray | None = None  # uint8 [T] of a dynamic tile, codes of the largest colour
+    affine: np.ndarray | None = None  # [2, 3] of a dynamic tile, shift and spread
     constant: np.ndarray | None = None  # float64 [T, 3], radiance of a constant tile
 
 
@@ -198,7 +194,7 @@ class SheetFit:
         self.index = np.arange(grid.count) if tiles is None else np.array(sorted(tiles), np.int64)
         check_index(self.index, grid)
         meter = Meter(progress, "tiles", len(self.index))
-        facts = _classify(lightmaps, self.index, meter, profile.gamma, profile.peak, profile.static_budget_db)
+        facts = _classify(lightmaps, self.index, meter, profile.gamma, profile.peak)
         self.kinds = np.array([tile.kind for tile in facts])
         framed = choose_frames(self.kinds, times, profile)
         self.warning = None
@@ -223,13 +219,10 @@ class SheetFit:
             constant=half if (np.abs(half - values) <= _CONSTANT_ERROR * values).all() else values.astype(np.float32),
             **arrays,
         )
-        self._mapped = np.flatnonzero(np.isin(self.kinds, (TileKind.STATIC, TileKind.DYNAMIC)))
-        for name, kind in (("scale", TileKind.DYNAMIC), ("scale_static", TileKind.STATIC)):
-            stored = [facts[row].scale for row in np.flatnonzero(self.kinds == kind)]
-            if stored:
-                getattr(self.model, name)[:] = stored
-        for i, row in enumerate(self._mapped):
-            self.model.peak[i], self.model.affine[i] = facts[row].peak, facts[row].affine
+        self._dynamic = np.flatnonzero(self.kinds == TileKind.DYNAMIC)
+        for i, row in enumerate(self._dynamic):
+            fact = facts[row]
+            self.model.scale[i], self.model.peak[i], self.model.affine[i] = fact.scale, fact.peak, fact.affine
         # The axis and the scales of a sheet do not change during a fit.
         self._axis, self._scale = self.model.axis, self.model.scales
         framed_rows = np.flatnonzero(self.kinds == TileKind.FRAMES)
@@ -244,56 +237,44 @@ class SheetFit:
         """Splits the tiles into batches of 1 to `most` tiles, about `BATCH_TEXELS` each, numbered from `first`."""
         size = max(1, BATCH_TEXELS // (len(self.model.times) * TILE * TILE))
         size = size if most is None else min(size, most)
-        result: list[Batch] = []
-        for kind in (TileKind.DYNAMIC, TileKind.STATIC):
-            rows = np.flatnonzero(self.kinds == kind)
-            for start in range(0, len(rows), size):
-                number, chosen = first + len(result), rows[start : start + size]
-                result.append(Batch(number, kind, chosen, start, self))
-        return result
+        rows = range(len(self._dynamic))
+        starts = enumerate(rows[::size], first)
+        return [Batch(number, rows[start : start + size], self) for number, start in starts]
 
     def job(self, batch: Batch) -> TileJob:
         """Returns the data of a batch that is sent to a worker."""
-        slots = np.searchsorted(self._mapped, batch.rows)
         return TileJob(
-            cut(self._lightmaps, self.index[batch.rows]),
-            batch.kind == TileKind.DYNAMIC,
-            self._scale[slots],
-            self.model.affine[slots].astype(np.float32),
+            cut(self._lightmaps, self.index[self._dynamic[batch.rows]]),
+            self._scale[batch.rows],
+            self.model.affine[batch.rows].astype(np.float32),
             self.model.profile,
             self._axis,
         )
 
     def table(self, batch: Batch) -> dict[str, Part]:
         """Returns the types and shapes of the arrays that the trainer returns for a finished batch, by name."""
-        kind = np.full(len(batch.rows), batch.kind, np.uint8)
+        kind = np.full(len(batch.rows), TileKind.DYNAMIC, np.uint8)
         table = part_table(self.model.profile, kind, len(self.model.times))
-        if batch.kind == TileKind.STATIC:
-            return {"net": table["net_static"], "uv": table["uv"]}
-        return {name: table[name] for name in ("net", "uv", "uvt", "ut", "vt")}
+        return {name: table[name] for name in _FITTED}
 
     def store(self, batch: Batch, parts: Parts, checkpoint: Checkpoint | None = None) -> None:
         """Copies the maps and networks of a finished batch, which may come from a checkpoint, into the model."""
-        dynamic, model = batch.kind == TileKind.DYNAMIC, self.model
         try:
-            check_packable(parts, model.profile, dynamic)
+            check_packable(parts, self.model.profile)
         except WlmError as error:
             raise WlmError(f"{checkpoint and checkpoint.path}: finished batch {batch.number}: {error}") from error
-        model.uv[np.searchsorted(self._mapped, batch.rows)] = parts["uv"]
-        arrays = ("uvt", "ut", "vt", "net") if dynamic else ("net",)
-        for name in arrays:
-            stored = getattr(model, name if dynamic else "net_static")
-            stored[batch.first : batch.first + len(batch.rows)] = parts[name]
+        for name in _FITTED:
+            getattr(self.model, name)[batch.rows] = parts[name]
 
 
 def _classify(
-    lightmaps: SheetFrames, numbers: np.ndarray, meter: Meter, gamma: float, peak: float | None, budget_db: float
+    lightmaps: SheetFrames, numbers: np.ndarray, meter: Meter, gamma: float, peak: float | None
 ) -> list[_Facts]:
     """Classifies tiles and computes the numbers that normalise each (section 4); for the settings see `Profile`."""
 
     def look(number: int) -> _Facts:
         tile = cut(lightmaps, np.array([number])).encoded(gamma, padded=False)
-        kind = TileKind(int(classify(tile, gamma, budget_db, peak)[0]))
+        kind = TileKind(int(classify(tile, gamma, peak)[0]))
         if kind == TileKind.EMPTY:
             return _Facts(kind)
         colour = tile.colour[0][:, tile.mask[0]]  # [T, K, 3], the valid texels
@@ -302,13 +283,8 @@ def _classify(
             # The middle of the range is at most half a step of half float off.
             middle = 0.5 * (radiance.min(1) + radiance.max(1)) if peak is None else radiance.mean(1)
             return _Facts(kind, constant=middle)
-        means = channel_means(tile.colour, tile.mask)[0]
-        if kind == TileKind.DYNAMIC:
-            stored = encode_scale(means, gamma)
-            scale = decode_scale(stored, gamma)
-        else:
-            stored = means.astype(np.float16)
-            scale = stored.astype(np.float32)
+        stored = encode_scale(channel_means(tile.colour, tile.mask)[0], gamma)
+        scale = decode_scale(stored, gamma)
         lit = scale > 0
         values = colour * np.divide(1.0, scale, out=np.zeros_like(scale), where=lit)[:, None]
         affine = np.empty((2, 3))

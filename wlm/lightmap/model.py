@@ -32,6 +32,7 @@ from wlm.lightmap.sheet import Sheet, first_light, layer_sheets
 from wlm.lightmap.tiles import TILE, TileGrid, TileKind
 from wlm.system import Model
 from wlm_kernels import mlp
+from wlm_kernels.lightmap.features import INPUTS
 
 BLOCKS = TILE // 4
 """Blocks along a side of a tile."""
@@ -42,23 +43,18 @@ SCALE_SPAN = (-21.0, 16.0)
 """Range of scale codes as log2 of radiance: from small half floats to the largest one."""
 
 
-MAPPED_KINDS = TileKind.STATIC, TileKind.DYNAMIC
-"""The kinds of tiles that have feature maps."""
-
-PACKED_KINDS = *MAPPED_KINDS, TileKind.FRAMES
+PACKED_KINDS = TileKind.DYNAMIC, TileKind.FRAMES
 """The kinds of tiles that are packed: each is a piece of the file, which is read alone."""
 
-PACKED = ("uv", "uvt", "ut", "vt", "net", "net_static", "frames")
+PACKED = ("uv", "uvt", "ut", "vt", "net", "frames")
 """The arrays of a sheet that are packed by tile."""
 
 _KINDS = {
-    **dict.fromkeys(("uv", "peak", "affine"), MAPPED_KINDS),
-    **dict.fromkeys(("uvt", "ut", "vt", "net", "scale"), (TileKind.DYNAMIC,)),
-    **dict.fromkeys(("net_static", "scale_static"), (TileKind.STATIC,)),
-    "constant": (TileKind.CONSTANT,),
-    **dict.fromkeys(("frames", "ranges"), (TileKind.FRAMES,)),
+    **dict.fromkeys(("uv", "uvt", "ut", "vt", "net", "scale", "peak", "affine"), TileKind.DYNAMIC),
+    "constant": TileKind.CONSTANT,
+    **dict.fromkeys(("frames", "ranges"), TileKind.FRAMES),
 }
-"""The kinds of tiles that have a row in each array, by rising number."""
+"""The kind of tiles that have a row in each array, by rising number."""
 
 
 def encode_scale(values: np.ndarray, gamma: float, up: bool = False) -> np.ndarray:
@@ -94,24 +90,20 @@ def part_table(profile: Profile, kind: np.ndarray, times: int) -> dict[str, Part
     """Returns the types and shapes of the arrays of a sheet with tiles of the given `TileKind`s, uint8 [tiles], at T =
     `times` times.
 
-    N_m tiles have feature maps (static and dynamic tiles, by rising number) and N_d of them are dynamic, with temporal
-    maps; N_c tiles are constant and N_f are stored as frames.
+    The rows are the tiles of one kind, by rising number: dynamic, constant or stored as frames.
     """
-    _, constant, static, dynamic, framed = np.bincount(kind, minlength=len(TileKind)).tolist()
-    mapped, r = dynamic + static, profile.uvt_resolution // 4
+    constant, dynamic, framed = (int((kind == own).sum()) for own in (TileKind.CONSTANT, *PACKED_KINDS))
+    r = profile.uvt_resolution // 4
     plane = Part(np.uint8, (dynamic, profile.plane_rows, profile.plane_columns, 2))
-    parameters, static_parameters = (mlp.parameter_count(profile.inputs(t), profile.hidden) for t in (True, False))
     return {
-        "uv": Part(np.uint8, (mapped, BLOCKS, BLOCKS, BLOCK_BYTES)),
+        "uv": Part(np.uint8, (dynamic, BLOCKS, BLOCKS, BLOCK_BYTES)),
         "uvt": Part(np.uint8, (dynamic, profile.uvt_slices, r, r, BLOCK_BYTES)),
         "ut": plane,
         "vt": plane,
-        "net": Part(np.float16, (dynamic, parameters)),
-        "net_static": Part(np.float16, (static, static_parameters)),
+        "net": Part(np.float16, (dynamic, mlp.parameter_count(INPUTS, profile.hidden))),
         "scale": Part(np.uint8, (dynamic, times, 3)),
-        "scale_static": Part(np.float16, (static, times, 3), least=0.0),
-        "peak": Part(np.uint8, (mapped, times)),
-        "affine": Part(np.float16, (mapped, 2, 3), least=0.0),
+        "peak": Part(np.uint8, (dynamic, times)),
+        "affine": Part(np.float16, (dynamic, 2, 3), least=0.0),
         "constant": Part((np.float16, np.float32), (constant, times, 3), least=0.0, most=HALF_MAX),
         "frames": Part(np.uint8, (framed, times, BLOCKS, BLOCKS, BLOCK_BYTES)),
         "ranges": Part(np.float16, (framed, times, 2, 3), least=0.0),
@@ -134,11 +126,8 @@ class SheetModel:
         uv: BC7 blocks of F_uv.
         uvt: BC7 blocks of F_uvt, slice by slice.
         ut, vt: F_ut and F_vt, one row for each step of time.
-        net: Networks of dynamic tiles, `hidden` rows and then `output` rows, see `wlm_kernels.mlp`.
-        net_static: Networks of static tiles.
+        net: Networks, `hidden` rows and then `output` rows, see `wlm_kernels.mlp`.
         scale: Codes of the mean of each channel at each time, in gamma space.
-        scale_static: The means of static tiles as half floats: their network does not get the time as an input, so it
-            cannot compensate for coarse rounding.
         peak: Codes of an upper bound of the tile at each time, in gamma space: the colour of level 255 of the 8-bit
             output.
         affine: The numbers `shift` and `spread` of the formula at the top of the module.
@@ -161,9 +150,7 @@ class SheetModel:
     ut: np.ndarray
     vt: np.ndarray
     net: np.ndarray
-    net_static: np.ndarray
     scale: np.ndarray
-    scale_static: np.ndarray
     peak: np.ndarray
     affine: np.ndarray
     constant: np.ndarray
@@ -206,10 +193,10 @@ class SheetModel:
             )
         part.kind = np.zeros_like(self.kind)
         part.kind[chosen] = self.kind[chosen]
-        rows = {kinds: part.kind[self.numbers(*kinds)] > 0 for kinds in set(_KINDS.values())}
-        for name, kinds in _KINDS.items():
+        rows = {kind: part.kind[self.numbers(kind)] > 0 for kind in set(_KINDS.values())}
+        for name, kind in _KINDS.items():
             if name not in PACKED or stored is None:
-                setattr(part, name, getattr(self, name)[rows[kinds]])
+                setattr(part, name, getattr(self, name)[rows[kind]])
         if stored is not None:
             vars(part).update(stored.read(part))
         return part
@@ -254,18 +241,9 @@ class SheetModel:
         return self.grid.texels_of((self.kind != TileKind.EMPTY).reshape(self.grid.rows, self.grid.cols))
 
     @property
-    def mapped(self) -> np.ndarray:
-        """Numbers of the tiles with feature maps, in the order of `uv`, `peak` and `affine`, int [N_m]."""
-        return self.numbers(*MAPPED_KINDS)
-
-    @property
     def scales(self) -> np.ndarray:
-        """The mean of each channel of each tile with feature maps at each time, as decoded, float32 [N_m, T, 3]."""
-        kinds = self.kind[self.mapped]
-        result = np.empty((len(kinds), len(self.times), 3), np.float32)
-        result[kinds == TileKind.DYNAMIC] = decode_scale(self.scale, self.profile.gamma)
-        result[kinds == TileKind.STATIC] = self.scale_static
-        return result
+        """The mean of each channel of each dynamic tile at each time, as decoded, float32 [N, T, 3]."""
+        return decode_scale(self.scale, self.profile.gamma)
 
     @property
     def memory_bytes(self) -> int:
@@ -281,10 +259,6 @@ class SheetModel:
     def row(self, number: int) -> int:
         """Returns the index of tile `number` among the tiles of its own kind."""
         return int((self.kind[:number] == self.kind[number]).sum())
-
-    def map_row(self, number: int) -> int:
-        """Returns the index of tile `number` among the tiles that have feature maps."""
-        return int((self.mapped < number).sum())
 
 
 @dataclass(eq=False)

@@ -11,7 +11,6 @@ from wlm.errors import WlmError
 from wlm.formats.hours import neighbours
 from wlm.lightmap.sheet import Sheet
 from wlm.system import Settings
-from wlm_kernels.lightmap.features import STATIC_INPUTS, TEMPORAL_INPUTS
 
 _MOST_ALONG_TIME = 64
 _USUAL_TIMES = 26  # number of times of the paper's sets
@@ -74,8 +73,6 @@ class Profile(Settings):
     peak: float | None = Field(None, gt=0.0)
     """Range of values that errors are relative to, for data other than light; default: the range of the tile at each
     time, as in the paper's protocol."""
-    static_budget_db: float = Field(60.0, gt=0.0)
-    """A tile is stored as one pattern that only changes in brightness if its PSNR in dB is then at least this."""
     frames: Literal["auto", "never", "always"] = "auto"
     """The tiles stored as a BC7 image for each time instead of feature maps and a network. "auto": the tiles that
     take no more bytes of GPU memory as BC7 images."""
@@ -89,10 +86,10 @@ class Profile(Settings):
     def for_times(self, times: int) -> "Profile":
         """Returns the settings with the feature maps' size along time adapted to a set of `times` times.
 
-        With `follow_times` F_uvt, F_ut and F_vt have at most one slice or row for each stored time: more could only
-        hold interpolated values. Beyond 26 times the sizes grow in proportion, up to 64.
+        With `follow_times`, or one time, F_uvt, F_ut and F_vt have at most one slice or row for each stored time: more
+        could only hold interpolated values. Beyond 26 times the sizes grow in proportion, up to 64.
         """
-        if not self.follow_times:
+        if not self.follow_times and times > 1:
             return self
         sizes = {
             name: min(times, _MOST_ALONG_TIME, max(fixed, round(fixed * times / _USUAL_TIMES)))
@@ -103,10 +100,6 @@ class Profile(Settings):
     def for_sheet(self, sheet: Sheet) -> "Profile":
         """Returns the settings for one sheet; values that are not light get gamma 1, and errors relative to [0, 1]."""
         return self.override({"gamma": 1.0, "peak": 1.0}) if sheet.linear else self
-
-    def inputs(self, temporal: bool) -> int:
-        """Returns the number of inputs of a tile's network, with or without temporal feature maps."""
-        return TEMPORAL_INPUTS if temporal else STATIC_INPUTS
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,8 @@
 """Decodes to 32 bits per texel at run time: all data stays on the device, and a decode only launches kernels.
 
 `wlm.lightmap.Decoder` returns arrays on the host; the decoders of this module are for a renderer's loop. Each decodes
-the tiles of one kind of one sheet, without filling gaps between charts: an `ExactDecoder`, on CUDA a `MatrixDecoder`
-for dynamic tiles, and a `FrameDecoder`. `wlm.lightmap.VirtualTexture` fills gaps, adds light groups and has mips.
+the tiles of one kind of one sheet, without filling gaps between charts: an `ExactDecoder`, on CUDA a `MatrixDecoder`,
+and a `FrameDecoder`. `wlm.lightmap.VirtualTexture` fills gaps, adds light groups and has mips.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from wlm.lightmap.encodings.base import inverse_of, rgba
 from wlm.lightmap.encodings.frames import FrameTiles
 from wlm.lightmap.encodings.maps import MapTiles
 from wlm.lightmap.model import SheetModel
-from wlm.lightmap.tiles import TILE, TileKind
+from wlm.lightmap.tiles import TILE
 from wlm_kernels.lightmap import decode as decode_kernels
 from wlm_kernels.lightmap import matrix_decode, output
 
@@ -70,24 +70,22 @@ class RuntimeDecoder:
 
 
 class _MapDecoder(RuntimeDecoder):
-    """Base class of the decoders of static or dynamic tiles."""
+    """Base class of the decoders of dynamic tiles."""
 
     def __init__(
         self,
         model: SheetModel,
         device: str = "cpu",
         gelu: str | None = None,
-        kind: TileKind = TileKind.DYNAMIC,
         shared: bool = False,
     ) -> None:
-        """Uploads the tiles of one kind, STATIC or DYNAMIC, and allocates all buffers; the time is initially the first
-        stored one.
+        """Uploads the dynamic tiles and allocates all buffers; the time is initially the first stored one.
 
         `gelu` is a variant to use instead of the model's, see `wlm_kernels.mlp`; with `shared`, texels are linear
         radiance as RGB9E5 instead of 8-bit colour relative to `bounds`.
         """
         device, self.gelu = device_of(device), gelu_of(model, gelu)
-        self._tiles = MapTiles(model, kind, device, self.gelu)
+        self._tiles = MapTiles(model, device, self.gelu)
         self._states: list[decode_kernels.TimeState | None] = [None, None]
         super().__init__(model, device, shared)
 
@@ -110,7 +108,7 @@ class MatrixDecoder(_MapDecoder):
             raise WlmError("device: expected cuda for MatrixDecoder, got cpu")
         if profile.hidden % 16:
             raise WlmError(f"model: expected networks whose hidden width is a multiple of 16, got {profile.hidden}")
-        super().__init__(model, name, "fast", TileKind.DYNAMIC, shared)
+        super().__init__(model, name, "fast", shared)
         self._kernels = matrix_decode.matrix_kernels(profile.hidden, profile.uvt_resolution, shared)
         _, hidden, output_layers = self._tiles.arguments
         n = len(self.numbers)
@@ -127,7 +125,7 @@ class MatrixDecoder(_MapDecoder):
 
 
 class ExactDecoder(_MapDecoder):
-    """Plain decoder of static or dynamic tiles: a thread decodes a texel, in the training's order of operations.
+    """Plain decoder of dynamic tiles: a thread decodes a texel, in the training's order of operations.
 
     Between two stored times, a last kernel interpolates the results of both.
     """

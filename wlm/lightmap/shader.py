@@ -53,8 +53,7 @@ def record_fours(model: SheetModel) -> int:
 
 def texture_names(model: SheetModel) -> list[str]:
     """Returns the names of the textures that the shader of a sheet reads, in the order of their declarations."""
-    maps, dynamic = bool(len(model.uv)), bool(len(model.uvt))
-    needed = {"networks": maps, "uv": maps, "uvt": dynamic, "planes": dynamic, "frames": bool(len(model.frames))}
+    needed = dict.fromkeys(("networks", "uv", "uvt", "planes"), len(model.uv)) | {"frames": len(model.frames)}
     return [name for name in _TEXTURES if needed.get(name, True)]
 
 
@@ -72,16 +71,16 @@ def decode_glsl(model: SheetModel, values: tuple[float, float] | None = None, *,
     """
     profile, names = model.profile, texture_names(model)
     gelu = filled(__package__, f"gelu_{profile.gelu}.glsl")
-    dynamic = len(model.uvt)
+    dynamic = len(model.uv)
     side, slices = profile.uvt_resolution, profile.uvt_slices
     across = {
-        "uv": columns(len(model.uv), TILE, TILE),
+        "uv": columns(dynamic, TILE, TILE),
         "uvt": columns(dynamic * slices, side, side),
         "planes": columns(2 * dynamic, profile.plane_rows, profile.plane_columns),
         "frames": columns(len(model.frames), TILE, TILE),
     }
     wide = fours(profile)
-    second = (17 if dynamic else 5) * wide  # fours of a network before the weights of its second layer
+    second = 17 * wide  # fours of a network before the weights of its second layer
     third = second + (4 * wide + 1) * wide
     gamma, inverse = (", ".join([repr(float(number))] * 3) for number in (profile.gamma, 1.0 / profile.gamma))
     words = {
@@ -107,8 +106,6 @@ def decode_glsl(model: SheetModel, values: tuple[float, float] | None = None, *,
         "planes_height": -(-2 * dynamic // across["planes"]) * profile.plane_rows,
         "reach": REACH,
         "beyond": 2 * REACH * REACH + 1,
-        "static_size": 4 * wide,
-        "dynamic_size": 12 * wide,
         "second": second,
         "last": third + 4 * wide,
         "weights": third + 4 * wide + 1,
@@ -125,25 +122,18 @@ def decode_glsl(model: SheetModel, values: tuple[float, float] | None = None, *,
     frames = filled(__package__, "frames_kind.glsl", **words) if has_frames else ""
     unmapped = filled(__package__, "unmapped.glsl", frames=frames)
     unmapped = (filled(__package__, "frames.glsl", **words) if has_frames else "") + unmapped
-    maps = filled(__package__, "maps.glsl", **words) if "uvt" in names else ""
+    maps = filled(__package__, "maps.glsl", **words) if dynamic else ""
     if pairs:
         names.remove("valid")
         group, rows = GROUP_SIZE
         use = _COMPUTED.format(columns=group, rows=rows, tall=2 * rows, kilobytes=f"{words['weights'] / 64:.0f}")
         text = _head(names, words | {"use": use}) + maps + unmapped + linear
-        inputs = ["uv", "uvt", "planes"] if maps else ["uv"]
-        lines = _pair_lines(wide, inputs, third)
-        lines |= {
-            "copies": filled(__package__, "copy.glsl" if maps else "copy_static.glsl", **words),
-            "inputs": filled(__package__, "pair_inputs.glsl", **words) if maps else "",
-        }
-        text += filled(__package__, "pair.glsl", gelu=gelu, **lines, **words)
+        text += filled(__package__, "pair.glsl", gelu=gelu, **_pair_lines(wide, third), **words)
         return text + filled(__package__, "pair_colours.glsl", **words)
     text, kinds = _head(names, words | {"use": _DRAWN.format(last=f"wlm_{kind}")}) + maps, ""
-    if "networks" in names:
+    if dynamic:
         units = {name: "".join(line.format(j=j, at=4 * j) for j in range(wide)) for name, line in _UNITS.items()}
-        inputs, sums = (filled(__package__, f"{name}.glsl", **words) if maps else "" for name in ("inputs", "sums"))
-        text += filled(__package__, "network.glsl", gelu=gelu, inputs=inputs, sums=sums, **units, **words)
+        text += filled(__package__, "network.glsl", gelu=gelu, **units, **words)
         kinds = filled(__package__, "mapped_kind.glsl")
     text += (
         unmapped
@@ -153,7 +143,7 @@ def decode_glsl(model: SheetModel, values: tuple[float, float] | None = None, *,
     return text + linear + filled(__package__, "last.glsl", kind=kind)
 
 
-def _pair_lines(wide: int, inputs: list[str], third: int) -> dict[str, str]:
+def _pair_lines(wide: int, third: int) -> dict[str, str]:
     """Returns the lines of two texels' network that repeat for each four units, each with its number."""
 
     def reads(first: str, at: int, apart: int) -> str:
@@ -163,7 +153,7 @@ def _pair_lines(wide: int, inputs: list[str], third: int) -> dict[str, str]:
         return f"    {total} = {total} + {' + '.join(f'{x}.{axis} * w{k}' for k, axis in enumerate('xyzw'))};\n"
 
     made = {"biases": "", "sums": "", "products": "", "outputs": ""}
-    for k, name in enumerate(inputs):
+    for k, name in enumerate(("uv", "uvt", "planes")):
         made["sums"] += reads("i + ", 4 * k * wide, wide) + add("a0", f"{name}0") + add("a1", f"{name}1")
     for j in range(wide):
         two = (f"b[{2 * j}]", f"b[{2 * j + 1}]")

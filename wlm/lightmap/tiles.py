@@ -5,7 +5,6 @@ Each tile is fitted, stored and streamed on its own (neural-dynamic-gi, sections
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
@@ -126,10 +125,8 @@ class TileKind(IntEnum):
     """No valid texel: nothing is stored."""
     CONSTANT = 1
     """One colour at each time for all texels."""
-    STATIC = 2
-    """One colour per time and one pattern for all times: F_uv and a network."""
     DYNAMIC = 3
-    """All feature maps and a network."""
+    """Feature maps and a network."""
     FRAMES = 4
     """The lightmap of each time as BC7, see `wlm.lightmap.encodings.frames`."""
 
@@ -165,47 +162,27 @@ def channel_means(colour: np.ndarray, mask: np.ndarray) -> np.ndarray:
     return means
 
 
-def static_pattern(colour: np.ndarray, means: np.ndarray) -> np.ndarray:
-    """Computes each tile's mean pattern, whose product with the means fits a tile that only changes in brightness.
-
-    It is the sum of the colours over time divided by the sum of the means (from `channel_means`), so that a nearly
-    black time hardly counts and nothing is divided by 0. `means * pattern` is exact if the tile is the product of a
-    colour per time and a pattern. Returns float64 [N, 128, 128, 3] with a mean of 1 over the valid texels; 0 in a
-    channel that is black at every time.
-    """
-    total = means.sum(axis=1)[:, None, None, :]
-    pattern = np.zeros((len(colour), *colour.shape[2:]))
-    np.divide(colour.sum(axis=1, dtype=np.float64), total, out=pattern, where=total > 0)
-    return pattern
-
-
-def classify(tiles: TileData, gamma: float, static_budget_db: float = 60.0, peak: float | None = None) -> np.ndarray:
-    """Finds for each tile the simplest `TileKind` that represents it within an error budget.
+def classify(tiles: TileData, gamma: float, peak: float | None = None) -> np.ndarray:
+    """Finds the kind of each tile: `EMPTY`, `CONSTANT` or `DYNAMIC`.
 
     A tile's valid texels are compared in linear space:
 
     - `EMPTY`: the tile has no valid texel.
     - `CONSTANT`: at every time, the greatest value of each channel is at most one step of half float above the least.
-    - `STATIC`: `means * static_pattern` has a PSNR of at least the budget at every time, relative to the range of the
-      tile at that time (neural-dynamic-gi, section 10.2), or no channel of any texel is off by more than a step of half
-      float.
     - `DYNAMIC`: all other tiles.
 
-    For values that are not light, `peak` replaces the range, and a tile is also constant if, at every time, its channel
-    means have a PSNR of `_FLAT_DB` and no texel is off by more than `_OUTLIER` times the RMS error at that PSNR: 8-bit
+    For values that are not light, whose range is `peak`, a tile is also constant if, at every time, its channel means
+    have a PSNR of `_FLAT_DB` and no texel is off by more than `_OUTLIER` times the RMS error at that PSNR: 8-bit
     sources are never exactly flat.
 
     Args:
         tiles: From `split`.
         gamma: The gamma given to `split`.
-        static_budget_db: The lowest PSNR in decibels that makes a tile static; if infinite, only tiles that are exact
-            to a step of half float are static.
         peak: See `wlm.lightmap.profile.Profile.peak`.
 
     Returns:
         The `TileKind` of each tile, `[N]` int64.
     """
-    means = channel_means(tiles.colour, tiles.mask)
     kinds = np.empty(len(tiles.index), np.int64)
     for n, valid in enumerate(tiles.mask):
         colour = tiles.colour[n]
@@ -213,8 +190,6 @@ def classify(tiles: TileData, gamma: float, static_budget_db: float = 60.0, peak
             kinds[n] = TileKind.EMPTY
         elif _is_constant(colour, valid, gamma) or (peak and _is_flat(colour, valid, gamma, peak)):
             kinds[n] = TileKind.CONSTANT
-        elif _is_static(colour, valid, means[n], gamma, static_budget_db, peak):
-            kinds[n] = TileKind.STATIC
         else:
             kinds[n] = TileKind.DYNAMIC
     return kinds
@@ -265,19 +240,3 @@ def _is_flat(colour: np.ndarray, valid: np.ndarray, gamma: float, peak: float) -
     error = np.abs(linear - linear.mean(axis=1, keepdims=True))
     allowed = peak * 10.0 ** (-_FLAT_DB / 20.0)
     return bool((np.square(error).mean((1, 2)) <= allowed**2).all() and error.max() <= _OUTLIER * allowed)
-
-
-def _is_static(
-    colour: np.ndarray, valid: np.ndarray, means: np.ndarray, gamma: float, budget_db: float, set_peak: float | None
-) -> bool:
-    pattern = static_pattern(colour[None], means[None])[0][valid] ** gamma  # [K, 3]
-    for frame, mean in zip(colour, means, strict=True):
-        linear = frame[valid].astype(np.float64) ** gamma
-        error = np.abs(mean**gamma * pattern - linear)
-        if (error <= _STEP_SLACK * _half_step(linear)).all():
-            continue
-        peak = np.ptp(linear) if set_peak is None else set_peak
-        # A range of zero is one grey in all channels; the error above is then more than a step of half float.
-        if peak == 0.0 or 10.0 * math.log10(peak * peak / np.mean(np.square(error))) < budget_db:
-            return False
-    return True

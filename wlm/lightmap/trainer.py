@@ -20,6 +20,7 @@ from wlm.lightmap.tiles import TILE, TileCut
 from wlm.workers import each
 from wlm_kernels.lightmap import blocks, features, gather, levels
 from wlm_kernels.lightmap import step as lightmap_step
+from wlm_kernels.lightmap.features import INPUTS
 
 # The parts of a state, besides Adam's moments: attributes of a trainer.
 _STATE = ("maps", "hidden", "output", "loss", "control")
@@ -97,13 +98,10 @@ class Targets:
 
 @dataclass(frozen=True, eq=False)
 class TileJob:
-    """A batch of N tiles of one kind, sent to a worker, which computes the training data from it: light and masks of
-    the tiles, whether they are dynamic instead of static, `scale` and `affine` (see `Targets`), the settings and the
-    time axis.
-    """
+    """A batch of N tiles, sent to a worker, which computes the training data from it: light and masks of the tiles,
+    `scale` and `affine` (see `Targets`), the settings and the time axis."""
 
     tiles: TileCut
-    dynamic: bool
     scale: np.ndarray
     affine: np.ndarray
     profile: Profile
@@ -117,7 +115,7 @@ class TileJob:
 
 
 class Trainer:
-    """Trains N tiles of one kind together; see `stage` for the stages of the training.
+    """Trains N tiles together; see `stage` for the stages of the training.
 
     `state` holds everything that a later step depends on, so that a resumed fit continues exactly.
 
@@ -126,10 +124,8 @@ class Trainer:
         steps: Number of steps of the fit.
         frozen: The first step at which only the network is trained.
         device: The device, as `interop.check_device` returns it.
-        temporal: Whether the tiles are DYNAMIC instead of STATIC.
         numbers: int32 [N], numbers of the tiles in their grid.
         tiles: N, the number of tiles.
-        inputs: Number of inputs of the network.
         views: The maps by name, as `wlm_kernels.lightmap.features.Maps` has them: views of `maps`.
         maps: float32 [M], all M parameters of the maps.
         hidden, output: The networks, see `wlm_kernels.mlp`.
@@ -143,33 +139,28 @@ class Trainer:
         profile: Profile,
         axis: TimeAxis,
         targets: Targets,
-        temporal_maps: bool,
         seed: int,
         device: str,
         track: bool = False,
     ):
-        """Uploads the targets of STATIC or DYNAMIC tiles and draws the initial parameters.
+        """Uploads the targets and draws the initial parameters.
 
         The seed determines the initial parameters and all samples; `track` collects the errors that `psnr` needs.
         """
         self._track = track
-        self.axis, self.device, self.temporal = axis, device, temporal_maps
+        self.axis, self.device = axis, device
         self.steps, self.frozen = profile.steps, round(profile.freeze_from * profile.steps)
         self._quantised_from = round(profile.quantise_from * profile.steps)
         self._samples, self._integers, self._name = profile.samples, profile.net_bits == 8, profile.name
         self._first_rates, self._decay = (profile.map_rate, profile.net_rate), profile.adam_decay
         self.numbers, self.tiles = targets.number, len(targets.number)
-        self.inputs = profile.inputs(temporal_maps)
         n, r, slices = self.tiles, profile.uvt_resolution, profile.uvt_slices
+        plane = n, profile.plane_rows, profile.plane_columns, 2
         shapes: dict[str, tuple[int, ...]] = {"uv_endpoints": (n, 32, 32, 2, 4), "uv_weights": (n, TILE, TILE)}
-        if temporal_maps:
-            plane = n, profile.plane_rows, profile.plane_columns, 2
-            shapes |= {"uvt_endpoints": (n * slices, r // 4, r // 4, 2, 4), "uvt_weights": (n * slices, r, r)}
-            shapes |= {"ut": plane, "vt": plane}
+        shapes |= {"uvt_endpoints": (n * slices, r // 4, r // 4, 2, 4), "uvt_weights": (n * slices, r, r)}
+        shapes |= {"ut": plane, "vt": plane}
         self._cuda = device != "cpu"
-        self._kernels = lightmap_step.step_kernels(
-            temporal_maps, profile.hidden, profile.gelu, "cuda" if self._cuda else "cpu"
-        )
+        self._kernels = lightmap_step.step_kernels(profile.hidden, profile.gelu, "cuda" if self._cuda else "cpu")
         self._pool = None if self._cuda else ThreadPoolExecutor(CPU_LANES)
         if not self._cuda:
             # Two lanes that launch them at once would compile them twice into one file.
@@ -196,7 +187,7 @@ class Trainer:
             return torch.zeros(shape, dtype=dtype, device=device)
 
         self.maps = zeros(total)
-        self.hidden, self.output = zeros(n, self.inputs + hidden + 2, hidden), zeros(n, hidden + 1, 3)
+        self.hidden, self.output = zeros(n, INPUTS + hidden + 2, hidden), zeros(n, hidden + 1, 3)
         self.views, at = {}, 0
         self._offsets = features.Offsets()
         for key, shape in shapes.items():
@@ -296,7 +287,7 @@ class Trainer:
 
     def _draw(self, seed: int) -> None:
         """Draws random initial parameters. Each tile has its own generator, so that batching does not change them."""
-        hidden, inputs = self.hidden.shape[-1], self.inputs
+        hidden = self.hidden.shape[-1]
         maps = {key: np.empty(view.shape, np.float32) for key, view in self.views.items()}
         w = np.zeros(tuple(self.hidden.shape), np.float32)
         o = np.zeros(tuple(self.output.shape), np.float32)
@@ -305,8 +296,8 @@ class Trainer:
             for values in maps.values():
                 part = values.reshape(self.tiles, -1)
                 part[i] = random.uniform(0.25, 0.75, part.shape[1])
-            w[i, :inputs] = random.uniform(-1, 1, (inputs, hidden)) / math.sqrt(inputs)
-            w[i, inputs + 1 : inputs + 1 + hidden] = random.uniform(-1, 1, (hidden, hidden)) / math.sqrt(hidden)
+            w[i, :INPUTS] = random.uniform(-1, 1, (INPUTS, hidden)) / math.sqrt(INPUTS)
+            w[i, INPUTS + 1 : INPUTS + 1 + hidden] = random.uniform(-1, 1, (hidden, hidden)) / math.sqrt(hidden)
             o[i, :hidden] = random.uniform(-1, 1, (hidden, 3)) / math.sqrt(hidden)
         for key, values in maps.items():
             self.views[key].copy_(torch.from_numpy(values))
@@ -378,20 +369,19 @@ class Trainer:
         return float((-10.0 * torch.log10(mean.clamp_min(1e-12))).mean())
 
     def quantised(self) -> dict[str, np.ndarray]:
-        """Returns maps and networks as the file stores them, by their names in `SheetModel` (always `net`)."""
+        """Returns maps and networks as the file stores them, by their names in `SheetModel`."""
         nets = self.hidden, self.output
         if self._integers:
             nets = self._on_levels
             with interop.stream(self.device):
                 levels.put_on_levels(*self._levels_args)
         net = torch.cat([values.flatten(1) for values in nets], 1)
+        uvt = self._blocks("uvt")
         result = {"net": net.cpu().numpy().astype(np.float16), "uv": self._blocks("uv")}
-        if self.temporal:
-            uvt = self._blocks("uvt")
-            result["uvt"] = uvt.reshape(self.tiles, -1, *uvt.shape[1:])
-            for key in ("ut", "vt"):
-                plane = np.clip(self.views[key].cpu().numpy(), 0.0, 1.0)
-                result[key] = np.floor(plane * np.float32(255.0) + np.float32(0.5)).astype(np.uint8)
+        result["uvt"] = uvt.reshape(self.tiles, -1, *uvt.shape[1:])
+        for key in ("ut", "vt"):
+            plane = np.clip(self.views[key].cpu().numpy(), 0.0, 1.0)
+            result[key] = np.floor(plane * np.float32(255.0) + np.float32(0.5)).astype(np.uint8)
         return result
 
     def _blocks(self, name: str) -> np.ndarray:
@@ -464,8 +454,7 @@ class Fitter:
     def start(self, job: TileJob, states: list[dict[str, np.ndarray] | None]) -> Advance:
         """Starts a batch, or continues it from its saved state; raises ValueError if it is another batch's."""
         self.close()
-        options = job.dynamic, self._seed, self._device, self._track
-        self._trainer = Trainer(job.profile, job.axis, job.targets(), *options)
+        self._trainer = Trainer(job.profile, job.axis, job.targets(), self._seed, self._device, self._track)
         # All kernels of a batch are compiled before its first steps are reported.
         wp.load_module(blocks, self._device)
         if states[0] is not None:

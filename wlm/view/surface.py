@@ -25,7 +25,6 @@ _MESH = "mesh"
 _COLOURS = {
     TileKind.EMPTY: ("grey", (0.15, 0.15, 0.15)),
     TileKind.CONSTANT: ("blue", (0.25, 0.5, 1.0)),
-    TileKind.STATIC: ("green", (0.2, 0.8, 0.35)),
     TileKind.DYNAMIC: ("orange", (1.0, 0.45, 0.1)),
     TileKind.FRAMES: ("violet", (0.65, 0.35, 0.9)),
 }
@@ -150,7 +149,8 @@ class _LightmapScene(SurfaceScene):
 
     def tile_colours(self) -> np.ndarray:
         grid = TileGrid.of(self.height, self.width)
-        table = np.array([_COLOURS[kind][1] for kind in sorted(_COLOURS)], np.float32)
+        table = np.zeros((max(TileKind) + 1, 3), np.float32)
+        table[list(_COLOURS)] = [colour for _, colour in _COLOURS.values()]
         colours = table[self.model.kind].reshape(grid.rows, grid.cols, 3)
         whole = colours.repeat(TILE, 0).repeat(TILE, 1)
         # Dark borders separate tiles of one kind.

@@ -14,14 +14,13 @@ import warp as wp
 from wlm_kernels import mlp
 from wlm_kernels.interpolate import axis_index, cell, fraction
 from wlm_kernels.lightmap.blocks import stored_texel
-from wlm_kernels.lightmap.features import CENTRE, STATIC_INPUTS, TEMPORAL_INPUTS
+from wlm_kernels.lightmap.features import CENTRE, INPUTS, MAP_INPUTS
 from wlm_kernels.shared_exponent import pack_rgb9e5
 
 
 @wp.struct
 class Stored:
-    """The stored feature maps of N tiles (see `features`), with S slices in F_uvt. In static tiles all arrays but `uv`
-    are empty."""
+    """The stored feature maps of N tiles (see `features`), with S slices in F_uvt."""
 
     uv: wp.array4d[wp.uint64]  # [N, 32, 32, 2]
     uvt: wp.array4d[wp.uint64]  # [N * S, R/4, R/4, 2]
@@ -140,19 +139,12 @@ def finish_shared(time: TimeState, n: int, y: wp.vec3) -> wp.uint32:
     return pack_rgb9e5(finish_radiance(time, n, y))
 
 
-def finish_words(shared: bool) -> Any:
-    """Returns the `wp.func` that packs a network's output: `finish_shared` (RGB9E5) or `finish_bytes` (8-bit RGBA)."""
-    return finish_shared if shared else finish_bytes
-
-
 @functools.cache
-def texel_network(temporal: bool, hidden: int, gelu: str) -> Any:
+def texel_network(hidden: int, gelu: str) -> Any:
     """Builds (once) the `wp.func` that evaluates the network of tile n at its texel (y, x), for the arguments of
     `exact_kernels`: network_output(stored, hidden, output, tau, encoding, n, y, x), a vec3. `tau` is the position on
     the time axis, and `encoding`, vec4, the encoded time."""
-    inputs = TEMPORAL_INPUTS if temporal else STATIC_INPUTS
-    centred = 12 if temporal else 4
-    net = mlp.kernels(inputs, hidden, gelu)
+    net = mlp.kernels(INPUTS, hidden, gelu)
     vec_in, vec_hidden = net.vec_in, net.vec_hidden
     first, second, third, act = net.first, net.second, net.third, net.act
 
@@ -171,19 +163,18 @@ def texel_network(temporal: bool, hidden: int, gelu: str) -> Any:
         uv = stored_texel(stored.uv, n, y, x)
         for c in range(4):
             f[c] = uv[c]
-        if wp.static(temporal):
-            u = (float(x) + 0.5) / 128.0
-            v = (float(y) + 0.5) / 128.0
-            uvt = stored_volume_at(stored, n, u, v, tau)
-            ut = stored_plane_at(stored.ut, n, u, tau, stored.periodic)
-            vt = stored_plane_at(stored.vt, n, v, tau, stored.periodic)
-            for c in range(4):
-                f[4 + c] = uvt[c]
-                f[12 + c] = encoding[c]
-            for c in range(2):
-                f[8 + c] = ut[c]
-                f[10 + c] = vt[c]
-        for c in range(wp.static(centred)):
+        u = (float(x) + 0.5) / 128.0
+        v = (float(y) + 0.5) / 128.0
+        uvt = stored_volume_at(stored, n, u, v, tau)
+        ut = stored_plane_at(stored.ut, n, u, tau, stored.periodic)
+        vt = stored_plane_at(stored.vt, n, v, tau, stored.periodic)
+        for c in range(4):
+            f[4 + c] = uvt[c]
+            f[12 + c] = encoding[c]
+        for c in range(2):
+            f[8 + c] = ut[c]
+            f[10 + c] = vt[c]
+        for c in range(wp.static(MAP_INPUTS)):
             f[c] = (f[c] + 0.0 - 0.5) * CENTRE
         return third(output, n, act(second(hidden, n, act(first(hidden, n, f)))))
 
@@ -191,22 +182,20 @@ def texel_network(temporal: bool, hidden: int, gelu: str) -> Any:
 
 
 @functools.cache
-def exact_kernels(temporal: bool, hidden: int, gelu: str) -> tuple[Any, Any, Any]:
+def exact_kernels(hidden: int, gelu: str) -> tuple[Any, Any, Any]:
     """Builds (once) three kernels that decode whole tiles, one texel per thread.
 
     Args:
-        temporal: Whether the tiles have the temporal maps F_uvt, F_ut and F_vt.
         hidden: H, width of the hidden layers.
         gelu: One of `mlp.GELUS`.
 
     Returns:
         Kernels that write, in this order, linear radiance as vec3; gamma-space colour as uint32, 8-bit RGBA from the
         lowest byte; and linear radiance as uint32, RGB9E5. Their inputs are `Stored`; hidden layers, vecH
-        [N, I + H + 2] with I inputs; output layers, vec3 [N, H + 1]; `TimeState`; int [N], the index of each tile in
+        [N, 18 + H]; output layers, vec3 [N, H + 1]; `TimeState`; int [N], the index of each tile in
         `TimeState`; and int [n], the tiles to decode. Their output is [n, 128, 128].
     """
-    net = mlp.kernels(TEMPORAL_INPUTS if temporal else STATIC_INPUTS, hidden, gelu)
-    vec_hidden, network_output = net.vec_hidden, texel_network(temporal, hidden, gelu)
+    vec_hidden, network_output = wp.types.vector(hidden, float), texel_network(hidden, gelu)
 
     def decode_kernel(dtype: Any, finish: Any) -> wp.Kernel:
         @wp.kernel(module="unique", module_options={"enable_backward": False})
@@ -228,5 +217,5 @@ def exact_kernels(temporal: bool, hidden: int, gelu: str) -> tuple[Any, Any, Any
 
         return decode
 
-    words = (decode_kernel(wp.uint32, finish_words(shared)) for shared in (False, True))
+    words = (decode_kernel(wp.uint32, finish) for finish in (finish_bytes, finish_shared))
     return decode_kernel(wp.vec3, finish_radiance), *words

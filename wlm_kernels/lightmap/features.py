@@ -2,8 +2,8 @@
 
 A tile has the maps F_uv, F_uvt, F_ut and F_vt over its coordinates u and v and the time t, and an MLP
 (neural-dynamic-gi, eq. 5 and table 1). The MLP's inputs are, in order, 4 channels of F_uv, 4 of F_uvt, 2 of F_ut, 2 of
-F_vt and 4 of the encoded time; tiles without temporal maps use F_uv alone. A feature v in [0, 1] is scaled to (v - 1/2)
-sqrt(12): mean 0 and variance 1 where v is uniform.
+F_vt and 4 of the encoded time. A feature v in [0, 1] is scaled to (v - 1/2) sqrt(12): mean 0 and variance 1 where v is
+uniform.
 
 `step` is the training step that calls these functions; `gather` converts its sums to gradients; `adjoint` adds the
 maps' gradients; `decode` decodes tiles from their stored bytes.
@@ -16,15 +16,15 @@ import warp as wp
 from wlm_kernels.interpolate import axis_index, cell, fraction
 from wlm_kernels.lightmap.blocks import texel
 
-TEMPORAL_INPUTS = 16
-STATIC_INPUTS = 4
+INPUTS, MAP_INPUTS = 16, 12
+"""Inputs of a network, and those of them that come from the maps; the encoded time follows."""
+
 CENTRE = wp.constant(3.4641016151377544)  # sqrt(12)
 
 
 @wp.struct
 class Maps:
-    """The feature maps of N tiles (see the module), with S slices in F_uvt. In static tiles all arrays but the first
-    two are empty."""
+    """The feature maps of N tiles (see the module), with S slices in F_uvt."""
 
     uv_endpoints: wp.array4d[wp.vec4]  # [N, 32, 32, 2]
     uv_weights: wp.array3d[float]  # [N, 128, 128]

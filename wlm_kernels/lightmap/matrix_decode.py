@@ -1,4 +1,4 @@
-"""Decodes tiles with temporal maps on a GPU's matrix units (tensor cores), for hidden widths that are multiples of 16.
+"""Decodes tiles on a GPU's matrix units (tensor cores), for hidden widths that are multiples of 16.
 
 A launch does everything: a block of threads decodes a strip of a tile, for which it reads F_uvt, F_ut and F_vt at one
 hour, or at two between which it interpolates the radiance. A thread decodes the texels of a column. Activations and
@@ -15,7 +15,7 @@ import numpy as np
 import warp as wp
 
 from wlm_kernels.lightmap.decode import Stored, TimeState, bytes_over
-from wlm_kernels.lightmap.features import TEMPORAL_INPUTS
+from wlm_kernels.lightmap.features import INPUTS, MAP_INPUTS
 from wlm_kernels.lightmap.output import bound_of
 from wlm_kernels.native import native_source, on_cuda
 from wlm_kernels.shared_exponent import pack_rgb9e5
@@ -24,12 +24,11 @@ _ROWS = 16  # of texels in a strip, or half as many
 _SHARED = 48 << 10  # bytes of shared memory of a block
 _BOUNDS = (128, 4)  # threads of a block, blocks of a multiprocessor: 128 registers per thread
 _STEP = 16  # size of a matrix product: the hidden width is a multiple of it
-_MAPS = 12  # inputs that come from the maps; the encoded time follows
 _UV_SCALE = np.sqrt(12.0) / 255.0
 _SCALE = (np.sqrt(2.0 / np.pi) * 0.044715) ** (1.0 / 3.0)  # of arguments of GELU, whose x^3 then has the factor 1
 
 
-Maps = wp.types.vector(_MAPS, float)
+Maps = wp.types.vector(MAP_INPUTS, float)
 
 
 @wp.func_native(
@@ -67,13 +66,13 @@ def pack_networks(hidden: np.ndarray, output: np.ndarray) -> np.ndarray:
     """
     n, width = len(hidden), hidden.shape[2]
     first = np.zeros((n, _STEP, width))
-    first[:, :4], first[:, 4:_MAPS] = hidden[:, :4] * (_SCALE * _UV_SCALE), hidden[:, 4:_MAPS] * _SCALE
-    bias = TEMPORAL_INPUTS + 1 + width
+    first[:, :4], first[:, 4:MAP_INPUTS] = hidden[:, :4] * (_SCALE * _UV_SCALE), hidden[:, 4:MAP_INPUTS] * _SCALE
+    bias = INPUTS + 1 + width
     third = np.zeros((n, 2, width, 8))
     third[:, 0, :, :3] = third[:, 1, :, 4:7] = output[:, :-1] / (2.0 * _SCALE)
     layers = [
         _operands(first),
-        _operands(hidden[:, TEMPORAL_INPUTS + 1 : bias] / 2.0),
+        _operands(hidden[:, INPUTS + 1 : bias] / 2.0),
         _operands(third.reshape(n, 2 * width, 8)),
         np.ascontiguousarray(hidden[:, bias] * _SCALE, np.float16).view(np.uint32),
         np.pad(output[:, -1].astype(np.float32), ((0, 0), (0, 1))).view(np.uint32),
@@ -90,8 +89,8 @@ def packed_words(width: int) -> int:
 def pack_biases(hidden: np.ndarray) -> np.ndarray:
     """Returns of the first layers of N networks, as `pack_networks` takes them, the biases and their change by each of
     the four numbers of the encoded time, float32 [N, 5, H], scaled like the layers' sums."""
-    bias = hidden[:, TEMPORAL_INPUTS] + 0.5 * _UV_SCALE * hidden[:, :4].sum(1)
-    return (np.concatenate([bias[:, None], hidden[:, _MAPS:TEMPORAL_INPUTS]], 1) * _SCALE).astype(np.float32)
+    bias = hidden[:, INPUTS] + 0.5 * _UV_SCALE * hidden[:, :4].sum(1)
+    return (np.concatenate([bias[:, None], hidden[:, MAP_INPUTS:INPUTS]], 1) * _SCALE).astype(np.float32)
 
 
 def _operands(weights: np.ndarray) -> np.ndarray:
@@ -126,7 +125,7 @@ class MatrixKernels:
         """Decodes n of N tiles to 32 bits per texel.
 
         Args:
-            stored: The N tiles, all with temporal maps.
+            stored: The N tiles.
             packed: uint32 [N, words], from `pack_networks`.
             hidden: vecH [N, 18 + H], hidden layers.
             times: One time, or two between which radiance is interpolated linearly (neural-dynamic-gi, eq. 2).

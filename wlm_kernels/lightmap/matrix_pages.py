@@ -8,11 +8,9 @@ Read first: `pages`.
 """
 
 import functools
-from typing import Any
 
 import warp as wp
 
-from wlm_kernels.lightmap.blocks import stored_texel
 from wlm_kernels.lightmap.frames import StoredFrames
 from wlm_kernels.lightmap.matrix_decode import Maps, map_inputs, matrix_texels
 from wlm_kernels.lightmap.pages import (
@@ -46,7 +44,7 @@ GROUP = 16
 
 _BLOCK, _GROUP = wp.constant(BLOCK), wp.constant(GROUP)
 _TAU = wp.constant(TAU)
-_STATIC, _DYNAMIC = wp.constant(2), wp.constant(3)  # of `wlm.lightmap.tiles.TileKind`
+_DYNAMIC = wp.constant(3)  # of `wlm.lightmap.tiles.TileKind`
 
 
 @wp.func
@@ -82,58 +80,44 @@ def _sum_of_group(x: wp.vec4, size: int) -> wp.vec4:
 def page_kernel(hidden: int) -> wp.Kernel:
     """Builds (once) the kernel that decodes squares of texels, for networks of one hidden width, a multiple of 16.
 
-    The two arrays of the networks are those of `matrix_decode.pack_biases` and `pack_networks`, for static tiles with
-    weights of 0 for the inputs that they lack. GELU is its tanh form.
+    The two arrays of the networks are those of `matrix_decode.pack_biases` and `pack_networks`. GELU is its tanh form.
     """
     evaluate, vec_hidden = matrix_texels(hidden), wp.types.vector(hidden, float)
 
-    def build(temporal: bool) -> Any:
-        @wp.func
-        def light(
-            mapped: Mapped,
-            biases: wp.array2d[vec_hidden],
-            packed: wp.array2d[wp.uint32],
-            clock: wp.array2d[float],
-            target: int,
-            lead: float,
-            gamma: float,
-            n: int,
-            y: int,
-            x: int,
-        ) -> wp.vec3:
-            light = wp.vec3()
-            two = int(2)  # a variable keeps the loop rolled
-            for r in range(two):
-                weight = weight_at(clock, target, lead, r)
-                f = Maps()
-                number = int(-1)
-                if n >= 0 and weight > 0.0:
-                    number = n
-                    if wp.static(temporal):
-                        f = map_inputs(mapped.stored, n, clock[target, _TAU + r], y, x)
-                    else:
-                        uv = stored_texel(mapped.stored.uv, n, y, x)
-                        for c in range(4):
-                            f[c] = uv[c] * 255.0 - 128.0
-                out = evaluate(packed, biases, f, encoding_of(clock, target, r), number, 2 * target + r)
-                if number >= 0:
-                    light += weight * light_of(mapped, clock, target, r, n, gamma, out)
-            return light
-
+    @wp.func
+    def mapped_light(
+        mapped: Mapped,
+        biases: wp.array2d[vec_hidden],
+        packed: wp.array2d[wp.uint32],
+        clock: wp.array2d[float],
+        target: int,
+        lead: float,
+        gamma: float,
+        n: int,
+        y: int,
+        x: int,
+    ) -> wp.vec3:
+        light = wp.vec3()
+        two = int(2)  # a variable keeps the loop rolled
+        for r in range(two):
+            weight = weight_at(clock, target, lead, r)
+            f = Maps()
+            number = int(-1)
+            if n >= 0 and weight > 0.0:
+                number = n
+                f = map_inputs(mapped.stored, n, clock[target, _TAU + r], y, x)
+            out = evaluate(packed, biases, f, encoding_of(clock, target, r), number, 2 * target + r)
+            if number >= 0:
+                light += weight * light_of(mapped, clock, target, r, n, gamma, out)
         return light
-
-    moving_light, still_light = build(True), build(False)
 
     @wp.kernel(module="unique", module_options={"enable_backward": False})
     def decode_pages(
         # in:
         tiles: Tiles,
-        moving: Mapped,
-        moving_biases: wp.array2d[vec_hidden],
-        moving_packed: wp.array2d[wp.uint32],
-        still: Mapped,
-        still_biases: wp.array2d[vec_hidden],
-        still_packed: wp.array2d[wp.uint32],
+        mapped: Mapped,
+        biases: wp.array2d[vec_hidden],
+        packed: wp.array2d[wp.uint32],
         frames: StoredFrames,
         clock: wp.array2d[float],
         offsets: wp.array1d[wp.vec2i],
@@ -192,25 +176,17 @@ def page_kernel(hidden: int) -> wp.Kernel:
                     at = wp.vec3i(-1, 0, 0)
                     if inside:
                         at = sample_at(tiles, square, own + turn * threads, start)
-                    n_moving = int(-1)
-                    n_still = int(-1)
+                    n = int(-1)
                     light = wp.vec3()
                     weight = float(0.0)
                     if at[0] >= 0:
                         weight = weight_of(tiles, square, at)
                         kind = kind_of(tiles, square, at[0])
                         if kind == _DYNAMIC:
-                            n_moving = tiles.slot[at[0]]
-                        elif kind == _STATIC:
-                            n_still = tiles.slot[at[0]]
+                            n = tiles.slot[at[0]]
                         else:
                             light = stored_light(tiles, frames, clock, target, lead, gamma, kind, at)
-                    light += moving_light(
-                        moving, moving_biases, moving_packed, clock, target, lead, gamma, n_moving, at[1], at[2]
-                    )
-                    light += still_light(
-                        still, still_biases, still_packed, clock, target, lead, gamma, n_still, at[1], at[2]
-                    )
+                    light += mapped_light(mapped, biases, packed, clock, target, lead, gamma, n, at[1], at[2])
                     total += weight * wp.vec4(light[0], light[1], light[2], 1.0)
                 total = _sum_of_group(total, threads)
                 if inside and own == 0:

@@ -8,6 +8,7 @@ from typing import Any
 
 import warp as wp
 
+from wlm_kernels.lightmap.features import INPUTS
 from wlm_kernels.native import native_source, on_cuda
 
 BLOCK = 128  # threads of a CUDA block; the samples of a tile are a multiple of it there
@@ -18,30 +19,30 @@ memory of a block with its activations and weights."""
 
 
 @functools.cache
-def matrix_network(inputs: int, hidden: int, gelu: str) -> Any:
+def matrix_network(hidden: int, gelu: str) -> Any:
     """Builds (once) the `wp.func` that runs a network forward and backward for `BLOCK` samples of one tile.
 
-    The function's arguments are the layers of all networks, `hidden` [N, I + H + 2] and `output` [N, H + 1], see
+    The function's arguments are the layers of all networks, `hidden` [N, 18 + H] and `output` [N, H + 1], see
     `wlm_kernels.mlp`; the number `n` of the tile's network; each sample's inputs `f`, `target` and `weight` of the
     channels; `share`, a factor on every squared error; `row`, the number of this block of samples; and the results,
-    written for each block: `partial` [rows * (I + H + 2), H], `partial_out` [rows * (H + 1), 3] and `loss` [rows].
+    written for each block: `partial` [rows * (18 + H), H], `partial_out` [rows * (H + 1), 3] and `loss` [rows].
 
     It returns the gradient of the inputs of each sample, followed by the error of the output.
 
     Args:
-        inputs, hidden: I and H, the numbers of inputs, at most 16, and hidden units, one of `WIDTHS`.
+        hidden: H, the number of hidden units, one of `WIDTHS`.
         gelu: "exact" or "tanh".
     """
     if hidden not in WIDTHS:
         raise ValueError(f"hidden: expected one of {WIDTHS} on CUDA, got {hidden}")
-    vec_in, vec_hidden = wp.types.vector(inputs, float), wp.types.vector(hidden, float)
-    vec_result = wp.types.vector(inputs + 3, float)
+    vec_in, vec_hidden = wp.types.vector(INPUTS, float), wp.types.vector(hidden, float)
+    vec_result = wp.types.vector(INPUTS + 3, float)
     # A row of 64 halves spans all banks: its groups of 8 are permuted to avoid bank conflicts; other rows are padded.
     rows = {"STRIDE": hidden, "MASK": 7} if hidden == WIDTHS[-1] else {"STRIDE": hidden + 8, "MASK": 0}
-    constants = {"I": inputs, "H": hidden, "T": BLOCK, "EXACT": int(gelu == "exact"), **rows}
+    constants = {"I": INPUTS, "H": hidden, "T": BLOCK, "EXACT": int(gelu == "exact"), **rows}
     code = native_source("wlm_kernels", "matrix_units") + native_source(__package__, "matrix_step", **constants)
 
-    @wp.func_native(on_cuda(code, f"return wp::vec_t<{inputs + 3}, float>();"))
+    @wp.func_native(on_cuda(code, f"return wp::vec_t<{INPUTS + 3}, float>();"))
     def network(
         hidden: wp.array2d[vec_hidden],
         output: wp.array2d[wp.vec3],

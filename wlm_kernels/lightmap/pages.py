@@ -17,9 +17,7 @@ from typing import Any
 
 import warp as wp
 
-from wlm_kernels import mlp
 from wlm_kernels.lightmap.decode import Stored, texel_network
-from wlm_kernels.lightmap.features import STATIC_INPUTS, TEMPORAL_INPUTS
 from wlm_kernels.lightmap.frames import StoredFrames, frame_colour
 from wlm_kernels.lightmap.matrix_decode import powers
 from wlm_kernels.shared_exponent import pack_rgb9e5, unpack_rgb9e5
@@ -54,7 +52,7 @@ _FULL, _EMPTY = wp.constant(FULL), wp.constant(EMPTY)
 _BEFORE, _AFTER, _SHARE, _TAU, _WEIGHT, _FIRST, _SECOND, _MIX, _ENCODING = (
     wp.constant(i) for i in (BEFORE, AFTER, SHARE, TAU, WEIGHT, FIRST, SECOND, MIX, ENCODING)
 )
-_CONSTANT, _STATIC, _DYNAMIC = wp.constant(1), wp.constant(2), wp.constant(3)  # of `wlm.lightmap.tiles.TileKind`
+_CONSTANT, _DYNAMIC = wp.constant(1), wp.constant(3)  # of `wlm.lightmap.tiles.TileKind`
 COARSE_TEXELS = -1
 """Instead of the kind of a tile: its coarse texels are read."""
 _COARSE_TEXELS = wp.constant(COARSE_TEXELS)
@@ -372,64 +370,47 @@ def light_of(
     return powers(wp.max(c, wp.vec3()), gamma)
 
 
-def _lights(hidden: int, gelu: str) -> tuple[Any, Any]:
-    """Builds the `wp.func`s that read dynamic and static tiles at a texel."""
-    vec_hidden = mlp.kernels(TEMPORAL_INPUTS, hidden, gelu).vec_hidden
-    assert vec_hidden is mlp.kernels(STATIC_INPUTS, hidden, gelu).vec_hidden
-
-    def build(temporal: bool) -> Any:
-        network = texel_network(temporal, hidden, gelu)
-
-        @wp.func
-        def light(
-            mapped: Mapped,
-            hidden_layers: wp.array2d[vec_hidden],
-            output_layers: wp.array2d[wp.vec3],
-            clock: wp.array2d[float],
-            target: int,
-            lead: float,
-            gamma: float,
-            n: int,
-            y: int,
-            x: int,
-        ) -> wp.vec3:
-            light = wp.vec3()
-            two = int(2)  # a variable keeps the loop rolled
-            for r in range(two):
-                weight = weight_at(clock, target, lead, r)
-                if weight > 0.0:
-                    tau = clock[target, _TAU + r]
-                    encoding = encoding_of(clock, target, r)
-                    out = network(mapped.stored, hidden_layers, output_layers, tau, encoding, n, y, x)
-                    light += weight * light_of(mapped, clock, target, r, n, gamma, out)
-            return light
-
-        return light
-
-    return build(True), build(False)
-
-
 @functools.cache
 def page_kernel(hidden: int, gelu: str) -> wp.Kernel:
     """Builds (once) the kernel that decodes squares of texels, one texel per thread, for networks of one hidden width.
 
     Args:
         hidden: H, width of the hidden layers.
-        gelu: One of `mlp.GELUS`.
+        gelu: One of `wlm_kernels.mlp.GELUS`.
     """
-    moving_light, still_light = _lights(hidden, gelu)
-    vec_hidden = wp.types.vector(hidden, float)
+    network, vec_hidden = texel_network(hidden, gelu), wp.types.vector(hidden, float)
+
+    @wp.func
+    def mapped_light(
+        mapped: Mapped,
+        hidden_layers: wp.array2d[vec_hidden],
+        output_layers: wp.array2d[wp.vec3],
+        clock: wp.array2d[float],
+        target: int,
+        lead: float,
+        gamma: float,
+        n: int,
+        y: int,
+        x: int,
+    ) -> wp.vec3:
+        light = wp.vec3()
+        two = int(2)  # a variable keeps the loop rolled
+        for r in range(two):
+            weight = weight_at(clock, target, lead, r)
+            if weight > 0.0:
+                tau = clock[target, _TAU + r]
+                encoding = encoding_of(clock, target, r)
+                out = network(mapped.stored, hidden_layers, output_layers, tau, encoding, n, y, x)
+                light += weight * light_of(mapped, clock, target, r, n, gamma, out)
+        return light
 
     @wp.kernel(module="unique", module_options={"enable_backward": False})
     def decode_pages(
         # in:
         tiles: Tiles,
-        moving: Mapped,
-        moving_hidden: wp.array2d[vec_hidden],
-        moving_output: wp.array2d[wp.vec3],
-        still: Mapped,
-        still_hidden: wp.array2d[vec_hidden],
-        still_output: wp.array2d[wp.vec3],
+        mapped: Mapped,
+        hidden_layers: wp.array2d[vec_hidden],
+        output_layers: wp.array2d[wp.vec3],
         frames: StoredFrames,
         clock: wp.array2d[float],
         offsets: wp.array1d[wp.vec2i],
@@ -468,12 +449,8 @@ def page_kernel(hidden: int, gelu: str) -> wp.Kernel:
                         weight = weight_of(tiles, square, at)
                         each = wp.vec3()
                         if kind == _DYNAMIC:
-                            each = moving_light(
-                                moving, moving_hidden, moving_output, clock, target, lead, gamma, n, at[1], at[2]
-                            )
-                        elif kind == _STATIC:
-                            each = still_light(
-                                still, still_hidden, still_output, clock, target, lead, gamma, n, at[1], at[2]
+                            each = mapped_light(
+                                mapped, hidden_layers, output_layers, clock, target, lead, gamma, n, at[1], at[2]
                             )
                         else:
                             each = stored_light(tiles, frames, clock, target, lead, gamma, kind, at)
@@ -514,8 +491,8 @@ def decode(
 
     Args:
         kernel: From `page_kernel` or `matrix_pages.page_kernel`.
-        source: `Tiles`; `Mapped` and the two arrays of the networks of the dynamic tiles, and the same of the static
-            ones; the tiles stored as frames. The arrays are the hidden and output layers, or those of `matrix_pages`.
+        source: `Tiles`; `Mapped` and the two arrays of the networks; the tiles stored as frames. The arrays are the
+            hidden and output layers, or those of `matrix_pages`.
         clock: float [times, CLOCK], the times.
         offsets: vec2i [25], 0 and the offsets to the texels of a mip that may fill a gap, in search order.
         jobs: J squares; those of other groups are left as they are.

@@ -23,8 +23,8 @@ from wlm_kernels.lightmap.adjoint import scatters
 from wlm_kernels.lightmap.blocks import texel
 from wlm_kernels.lightmap.features import (
     CENTRE,
-    STATIC_INPUTS,
-    TEMPORAL_INPUTS,
+    INPUTS,
+    MAP_INPUTS,
     Batch,
     Maps,
     Offsets,
@@ -46,16 +46,11 @@ class StepKernels:
     """The training step for one network shape on one kind of device; see `launch`.
 
     Attributes:
-        inputs, hidden: Numbers I of inputs and H of hidden units of the network.
-        device_kind: "cpu" or "cuda".
         net: Forward and backward functions of the network.
         scalar: Type of the sums of the maps' gradients: int64 on CUDA, float on the CPU.
         draw: Kernel that writes the samples that the next step will draw, for tests.
     """
 
-    inputs: int
-    hidden: int
-    device_kind: str
     net: mlp.MlpKernels
     scalar: Any
     draw: Any
@@ -85,12 +80,12 @@ class StepKernels:
         Args:
             maps: The maps, whose M parameters are trained.
             offsets: Positions of the gradients of each map in `acc`.
-            hidden: vecH [N, I + H + 2], the hidden layers, see `wlm_kernels.mlp`.
+            hidden: vecH [N, 18 + H], the hidden layers, see `wlm_kernels.mlp`.
             output: vec3 [N, H + 1], the output layers.
             batch: The training data.
             samples: B; on CUDA a multiple of `BLOCK`.
             acc: [lanes, M], gradients of the maps, added to: int64 of one lane on CUDA, float of a lane per CPU thread.
-            partial: float [P, N, I + H + 2, H], gradients of the hidden layers: on CUDA of P blocks of `BLOCK` samples,
+            partial: float [P, N, 18 + H, H], gradients of the hidden layers: on CUDA of P blocks of `BLOCK` samples,
                 written; on the CPU of P lanes, added to.
             partial_out: float [P, N, H + 1, 3], gradients of the output layers, like `partial`.
             loss: float [P, N], sums of weighted squared errors over samples and channels / (3 B), like `partial`.
@@ -109,24 +104,21 @@ class StepKernels:
 
 
 @functools.cache
-def step_kernels(temporal: bool, hidden: int, gelu: str, device_kind: str) -> StepKernels:
-    """Builds (once) the training step for tiles with or without temporal maps.
+def step_kernels(hidden: int, gelu: str, device_kind: str) -> StepKernels:
+    """Builds (once) the training step for networks of one hidden width.
 
     Args:
-        temporal: Whether the tiles have F_uvt, F_ut, F_vt and the encoded time.
         hidden: H, width of the hidden layers; on CUDA one of `matrix_step.WIDTHS`.
         gelu: "exact" or "tanh".
         device_kind: "cpu" or "cuda".
     """
-    inputs = TEMPORAL_INPUTS if temporal else STATIC_INPUTS
-    noisy = 12 if temporal else 4
-    net = mlp.kernels(inputs, hidden, gelu)
+    net = mlp.kernels(INPUTS, hidden, gelu)
     vec_in, vec_hidden = net.vec_in, net.vec_hidden
     first, second, third = net.first, net.second, net.third
     gate, slope = net.gate, net.slope
     back_hidden, back_output, back_input = net.back_hidden, net.back_output, net.back_input
     scatter_texel, scatter_volume, scatter_plane, scalar = scatters(device_kind)
-    units, columns_2 = net.hidden, inputs + 1
+    units, columns_2 = net.hidden, INPUTS + 1
 
     @wp.func
     def features(maps: Maps, batch: Batch, n: int, y: int, x: int, k: int, state: wp.uint32) -> vec_in:
@@ -134,21 +126,20 @@ def step_kernels(temporal: bool, hidden: int, gelu: str, device_kind: str) -> St
         uv = texel(maps.uv_endpoints, maps.uv_weights, n, y, x, batch.quantised)
         for c in range(4):
             f[c] = uv[c]
-        if wp.static(temporal):
-            u = (float(x) + 0.5) / 128.0
-            v = (float(y) + 0.5) / 128.0
-            tau = batch.tau[k]
-            uvt = volume_at(maps, n, batch.slices, u, v, tau, batch.periodic, batch.quantised)
-            ut = plane_at(maps.ut, n, u, tau, batch.periodic, batch.quantised)
-            vt = plane_at(maps.vt, n, v, tau, batch.periodic, batch.quantised)
-            e = batch.encoding[k]
-            for c in range(4):
-                f[4 + c] = uvt[c]
-                f[12 + c] = e[c]
-            for c in range(2):
-                f[8 + c] = ut[c]
-                f[10 + c] = vt[c]
-        for c in range(wp.static(noisy)):
+        u = (float(x) + 0.5) / 128.0
+        v = (float(y) + 0.5) / 128.0
+        tau = batch.tau[k]
+        uvt = volume_at(maps, n, batch.slices, u, v, tau, batch.periodic, batch.quantised)
+        ut = plane_at(maps.ut, n, u, tau, batch.periodic, batch.quantised)
+        vt = plane_at(maps.vt, n, v, tau, batch.periodic, batch.quantised)
+        e = batch.encoding[k]
+        for c in range(4):
+            f[4 + c] = uvt[c]
+            f[12 + c] = e[c]
+        for c in range(2):
+            f[8 + c] = ut[c]
+            f[10 + c] = vt[c]
+        for c in range(wp.static(MAP_INPUTS)):
             # Eq. 6: noise in place of the rounding, until the maps are quantised.
             noise = wp.where(batch.quantised == 0, (wp.randf(state) - 0.5) * NOISE, 0.0)
             f[c] = (f[c] + noise - 0.5) * CENTRE
@@ -169,28 +160,15 @@ def step_kernels(temporal: bool, hidden: int, gelu: str, device_kind: str) -> St
         y = sample.flat // 128
         x = sample.flat % 128
         scatter_texel(acc, lane, offsets, maps, n, y, x, batch.quantised, c * wp.vec4(g[0], g[1], g[2], g[3]))
-        if wp.static(temporal):
-            u = (float(x) + 0.5) / 128.0
-            v = (float(y) + 0.5) / 128.0
-            tau = batch.tau[sample.k]
-            scatter_volume(
-                acc,
-                lane,
-                offsets,
-                maps,
-                n,
-                batch.slices,
-                u,
-                v,
-                tau,
-                batch.periodic,
-                batch.quantised,
-                c * wp.vec4(g[4], g[5], g[6], g[7]),
-            )
-            rows = maps.ut.shape[1]
-            columns = maps.ut.shape[2]
-            scatter_plane(acc, lane, offsets.ut, rows, columns, n, u, tau, batch.periodic, c * wp.vec2(g[8], g[9]))
-            scatter_plane(acc, lane, offsets.vt, rows, columns, n, v, tau, batch.periodic, c * wp.vec2(g[10], g[11]))
+        u = (float(x) + 0.5) / 128.0
+        v = (float(y) + 0.5) / 128.0
+        tau = batch.tau[sample.k]
+        volume = c * wp.vec4(g[4], g[5], g[6], g[7])
+        scatter_volume(acc, lane, offsets, maps, n, batch.slices, u, v, tau, batch.periodic, batch.quantised, volume)
+        rows = maps.ut.shape[1]
+        columns = maps.ut.shape[2]
+        scatter_plane(acc, lane, offsets.ut, rows, columns, n, u, tau, batch.periodic, c * wp.vec2(g[8], g[9]))
+        scatter_plane(acc, lane, offsets.vt, rows, columns, n, v, tau, batch.periodic, c * wp.vec2(g[10], g[11]))
 
     options = {"enable_backward": False}
 
@@ -249,9 +227,9 @@ def step_kernels(temporal: bool, hidden: int, gelu: str, device_kind: str) -> St
             d3 = 2.0 * half
             d2 = wp.cw_mul(back_output(output, n, d3), slope(a2, g2))
             d1 = wp.cw_mul(back_hidden(hidden, n, d2), slope(a1, g1))
-            for c in range(wp.static(inputs)):
+            for c in range(wp.static(INPUTS)):
                 partial[lane, n, c] += d1 * f[c]
-            partial[lane, n, wp.static(inputs)] += d1
+            partial[lane, n, wp.static(INPUTS)] += d1
             for c in range(wp.static(units)):
                 partial[lane, n, wp.static(columns_2) + c] += d2 * h1[c]
                 partial_out[lane, n, c] += d3 * h2[c]
@@ -260,7 +238,7 @@ def step_kernels(temporal: bool, hidden: int, gelu: str, device_kind: str) -> St
             scatter(acc, lane, offsets, maps, batch, n, sample, back_input(hidden, n, d1))
 
     else:
-        network = matrix_network(inputs, hidden, gelu)
+        network = matrix_network(hidden, gelu)
 
         @wp.kernel(module="unique", module_options=options, launch_bounds=LAUNCH_BOUNDS)
         def step(
@@ -287,11 +265,11 @@ def step_kernels(temporal: bool, hidden: int, gelu: str, device_kind: str) -> St
             row = (b // wp.static(BLOCK)) * hidden.shape[0] + n
             share = 1.0 / (3.0 * float(samples))
             r = network(hidden, output, n, f, target, weight, share, row, partial, partial_out, loss)
-            error = wp.vec3(r[wp.static(inputs)], r[wp.static(inputs + 1)], r[wp.static(inputs + 2)])
+            error = wp.vec3(r[wp.static(INPUTS)], r[wp.static(INPUTS + 1)], r[wp.static(INPUTS + 2)])
             track_error(batch, 0, n, k, target, error)
             g = vec_in()
-            for c in range(wp.static(inputs)):
+            for c in range(wp.static(INPUTS)):
                 g[c] = r[c]
             scatter(acc, 0, offsets, maps, batch, n, sample, g)
 
-    return StepKernels(inputs, hidden, device_kind, net, scalar, draw, step)
+    return StepKernels(net, scalar, draw, step)

@@ -40,7 +40,7 @@ def test_what_it_decodes_to_is_what_the_product_decodes():
     decoded = fit.decode()
     assert decoded.shape == (2, len(lightmaps.times), 128, 128, 3)
     model = compress(whole, profile).sheets[LIGHT]
-    trainer = Trainer(profile, model.axis, dynamic_targets(lightmaps, profile), True, 0, "cpu")
+    trainer = Trainer(profile, model.axis, dynamic_targets(lightmaps, profile), 0, "cpu")
     put_into_trainer(fit, trainer)
     for name, values in trainer.quantised().items():
         setattr(model, name, values)
@@ -56,7 +56,7 @@ def test_its_loss_is_that_of_the_kernels():
     lightmaps = moving_light(128, 128).light
     profile = tiny_profile(samples=16384, steps=10, map_rate=1e-12, net_rate=1e-12)
     fit, targets = plain_fit(lightmaps, profile), dynamic_targets(lightmaps, profile)
-    trainer = Trainer(profile, TimeAxis(lightmaps.times, 24.0, "frames"), targets, True, 0, "cpu")
+    trainer = Trainer(profile, TimeAxis(lightmaps.times, 24.0, "frames"), targets, 0, "cpu")
     put_into_trainer(fit, trainer)
     trainer.run(1)
     theirs = 50.0 * float(trainer.losses()[0])  # a running mean that begins at 0

@@ -13,7 +13,7 @@ from wlm.texels import near_gaps
 def test_the_map_is_that_of_the_host(time, device):
     mask = np.zeros((236, 375), bool)
     mask[20:60, 30:128] = mask[100:180, 60:90] = mask[40:200, 126:150] = mask[130:200, 200:340] = True
-    model = random_sheet((3, 4, 2, 1, 4, 3), mask=mask, columns=3)
+    model = random_sheet((3, 4, 3, 1, 4, 3), mask=mask, columns=3)
     decoder = WholeMap(model, device)
     decoder.set_time(time)
     decoder.decode()

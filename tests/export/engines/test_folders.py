@@ -29,7 +29,7 @@ from wlm.inspection import inspect
 from wlm.lightmap.bundle import sheet_bundle
 from wlm.lightmap.decode import Decoder
 
-ALL = (4, 3, 2, 1, 4, 0)
+ALL = (4, 3, 3, 1, 4, 0)
 
 
 def atlas_model(kind, stored="half", mesh=None):
@@ -149,7 +149,7 @@ def test_blocks_that_do_not_fill_their_texture_become_half_floats(tmp_path):
     assert (tmp_path / "out" / "colour.dds").read_bytes().endswith(model.blocks.tobytes())
 
 
-@pytest.mark.parametrize("kinds", [ALL, (2, 1, 0, 2)], ids=str)
+@pytest.mark.parametrize("kinds", [ALL, (3, 1, 0, 3)], ids=str)
 def test_godots_passes_compile(kinds, tmp_path):
     model = random_lightmap(kinds)
     export(model, tmp_path / "out", "godot")
@@ -201,7 +201,7 @@ def test_godots_lit_surface_mixes_two_hours(tmp_path):
     np.testing.assert_allclose(found[0, 0, :3], 0.2 * 1.5, atol=1e-3)
 
 
-@pytest.mark.parametrize("kinds", [ALL, (2, 1, 0, 2)], ids=str)
+@pytest.mark.parametrize("kinds", [ALL, (3, 1, 0, 3)], ids=str)
 def test_unitys_passes_compile(kinds, tmp_path):
     model = random_lightmap(kinds)
     export(model, tmp_path / "unity", "unity")
@@ -353,7 +353,7 @@ def test_an_atlas_node_gives_its_light(kind, tmp_path, monkeypatch):
     np.testing.assert_allclose(found, decode64(model, uv), rtol=0, atol=allowed)
 
 
-@pytest.mark.parametrize("kinds", [ALL, (2, 1, 0, 2)], ids=str)
+@pytest.mark.parametrize("kinds", [ALL, (3, 1, 0, 3)], ids=str)
 def test_lightmap_nodes_decode_an_hour_and_fill_its_gaps(kinds, tmp_path, monkeypatch):
     mask = np.ones((128 * len(kinds) // 2 - 20, 247), bool)
     mask[40:42, 60:62] = False
@@ -380,7 +380,7 @@ def test_lightmap_nodes_decode_an_hour_and_fill_its_gaps(kinds, tmp_path, monkey
 
 
 def test_times_without_a_day(tmp_path, monkeypatch):
-    model = random_lightmap((2, 1), period=None)
+    model = random_lightmap((3, 1), period=None)
     export(model, tmp_path, "unreal")
     neighbours = Script(tmp_path / "wlm_lightmap.py", monkeypatch).names["neighbours"]
     for time in (0.0, 7.5, 10.0, 19.0):

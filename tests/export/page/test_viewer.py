@@ -114,7 +114,7 @@ def test_files_of_lightmaps(name, view):
     ],
 )
 def test_lightmaps_of_other_settings(settings, tmp_path, view):
-    synthetic.random_model((3, 2, 4, 1, 3, 3), 3, **settings).save(tmp_path / "random.wlm")
+    synthetic.random_model((3, 3, 4, 1, 3, 3), 3, **settings).save(tmp_path / "random.wlm")
     page = view(tmp_path / "random.wlm")
     check_content(page, [tmp_path / "random.wlm"])
     check_light(page, tmp_path / "random.wlm")

@@ -1,4 +1,4 @@
-    if (int(tile.x) == 3) {
+    if (int(tile.x) == 4) {
         vec3 early = wlm_lightmap_of_frames(tile, record + 1, inner);
         if (tile.w == 0.0)
             return early;

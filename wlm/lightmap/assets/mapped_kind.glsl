@@ -1,2 +1,2 @@
-    if (int(tile.x) == 1 || int(tile.x) == 2)
+    if (int(tile.x) == 3)
         return wlm_lightmap_mapped(tile, record, inner);

@@ -16,14 +16,19 @@ vec3 wlm_lightmap_mapped(vec4 tile, int record, ivec2 inner)
 {
     int row = int(tile.y);
     int start = int(tile.z);
-    int second = start + 5 * WLM_LIGHTMAP_FOURS;
+    int second = start + 17 * WLM_LIGHTMAP_FOURS; // the encoded time is in the bias
     ivec2 at = ivec2(row % @uv_columns@, row / @uv_columns@) * @TILE@ + inner;
     vec4 uv = texelFetch(WLM_LIGHTMAP_UV, at, 0);
-@inputs@    int third = second + (4 * WLM_LIGHTMAP_FOURS + 1) * WLM_LIGHTMAP_FOURS;
+    vec2 place = (vec2(inner) + vec2(0.5, 0.5)) / @TILE@.0;
+    vec4 uvt = wlm_lightmap_volume(row, place);
+    vec4 planes = vec4(wlm_lightmap_plane(2 * row, place.x), wlm_lightmap_plane(2 * row + 1, place.y));
+    int third = second + (4 * WLM_LIGHTMAP_FOURS + 1) * WLM_LIGHTMAP_FOURS;
     vec4 b[WLM_LIGHTMAP_FOURS];
 @biases@    for (int i = 0; i < WLM_LIGHTMAP_FOURS; i++) {
         vec4 a = wlm_lightmap_add(wlm_lightmap_entry(record + 3 + i), uv, start + i, WLM_LIGHTMAP_FOURS);
-@sums@        a = wlm_gelu(a);
+        a = wlm_lightmap_add(a, uvt, start + 4 * WLM_LIGHTMAP_FOURS + i, WLM_LIGHTMAP_FOURS);
+        a = wlm_lightmap_add(a, planes, start + 8 * WLM_LIGHTMAP_FOURS + i, WLM_LIGHTMAP_FOURS);
+        a = wlm_gelu(a);
         int w = second + 4 * WLM_LIGHTMAP_FOURS * i;
 @products@    }
     vec4 y = wlm_lightmap_four(third + 4 * WLM_LIGHTMAP_FOURS);

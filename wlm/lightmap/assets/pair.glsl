@@ -8,9 +8,10 @@ void wlm_lightmap_begin(ivec2 texel, int index)
 {
     ivec2 place = texel / @TILE@;
     vec4 tile = wlm_lightmap_entry(@head@ + (place.y * WLM_LIGHTMAP_COLUMNS + place.x) * WLM_LIGHTMAP_RECORD);
-    int kind = int(tile.x);
-    int count = kind == 1 || kind == 2 ? @weights@ : 0;
-@copies@    barrier();
+    int count = int(tile.x) == 3 ? @weights@ : 0;
+    for (int i = index; i < count; i += @invocations@)
+        wlm_lightmap_weights[i] = wlm_lightmap_four(int(tile.z) + i);
+    barrier();
 }
 
 // Colours of two texels of a tile of maps, @below@ rows apart: `record` is the position of its record, `inner` the
@@ -23,7 +24,15 @@ void wlm_lightmap_mapped(vec4 tile, int record, ivec2 inner, out vec3 colour[2])
     ivec2 at = ivec2(row % @uv_columns@, row / @uv_columns@) * @TILE@ + inner;
     vec4 uv0 = texelFetch(WLM_LIGHTMAP_UV, at, 0);
     vec4 uv1 = texelFetch(WLM_LIGHTMAP_UV, at + ivec2(0, @below@), 0);
-@inputs@    vec4 w0;
+    vec2 place = (vec2(inner) + vec2(0.5, 0.5)) / @TILE@.0;
+    vec2 under = (vec2(inner) + vec2(0.5, 0.5 + @below@.0)) / @TILE@.0;
+    vec2 ut = wlm_lightmap_plane(2 * row, place.x);
+    vec4 uvt0 = wlm_lightmap_volume(row, place);
+    vec4 uvt1 = wlm_lightmap_volume(row, under);
+    vec4 planes0 = vec4(ut, wlm_lightmap_plane(2 * row + 1, place.y));
+    vec4 planes1 = vec4(ut, wlm_lightmap_plane(2 * row + 1, under.y));
+    // The encoded time is in the bias.
+    vec4 w0;
     vec4 w1;
     vec4 w2;
     vec4 w3;

@@ -6,7 +6,7 @@ void wlm_lightmap_pair(ivec2 texel, out vec3 light[2])
     ivec2 inner = texel - place * @TILE@;
     int record = @head@ + (place.y * WLM_LIGHTMAP_COLUMNS + place.x) * WLM_LIGHTMAP_RECORD;
     vec4 tile = wlm_lightmap_entry(record);
-    if (int(tile.x) == 1 || int(tile.x) == 2) {
+    if (int(tile.x) == 3) {
         wlm_lightmap_mapped(tile, record, inner, light);
     } else {
         light[0] = wlm_lightmap_unmapped(tile, record, inner);

@@ -9,7 +9,7 @@ from wlm.lightmap.tiles import TileKind
 ENCODINGS: tuple[Encoding, ...] = (Maps(), Frames(), Constant())
 """All encodings; empty tiles are not stored and have no encoding."""
 
-_BY_KIND = {kind: encoding for encoding in ENCODINGS for kind in encoding.kinds}
+_BY_KIND = {encoding.kind: encoding for encoding in ENCODINGS}
 
 
 def encoding_of(kind: int) -> Encoding | None:

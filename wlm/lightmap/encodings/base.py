@@ -36,11 +36,9 @@ class DeviceTiles(ABC):
 
 
 class Encoding(ABC):
-    """One way to store tiles of some kinds; `codes` has the number of each of these kinds in the shader's tables, see
-    `wlm.lightmap.bundle.hour_tables`."""
+    """One way to store tiles, those of one kind."""
 
-    kinds: ClassVar[tuple[TileKind, ...]]
-    codes: ClassVar[tuple[int, ...]]
+    kind: ClassVar[TileKind]
 
     def packed_size(self, sheet: SheetModel, number: int) -> int:
         """Returns the number of bytes that `pack` gives for a tile: 0, unless a subclass overrides both."""

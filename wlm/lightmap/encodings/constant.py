@@ -31,8 +31,7 @@ class ConstantTiles(DeviceTiles):
 class Constant(Encoding):
     """Stores one colour for each time in the arrays of the sheet; `pack` gives no bytes."""
 
-    kinds = (TileKind.CONSTANT,)
-    codes = (0,)
+    kind = TileKind.CONSTANT
 
     def upload(self, sheet: SheetModel, device: str, gelu: str) -> list[DeviceTiles]:
         return [ConstantTiles(sheet)] if len(sheet.constant) else []

@@ -48,12 +48,8 @@ def missing_encoder(count: int) -> str | None:
 def choose_frames(kinds: np.ndarray, times: int, profile: Profile) -> np.ndarray:
     """Returns which of N tiles, of the given `TileKind`s and number of stored times, are stored as frames, see
     `Profile.frames`, bool [N]."""
-    chosen = np.isin(kinds, (TileKind.STATIC, TileKind.DYNAMIC))
-    if profile.frames == "auto":
-        for kind in (TileKind.STATIC, TileKind.DYNAMIC):
-            network = tile_bytes(profile, kind == TileKind.DYNAMIC)
-            chosen &= (kinds != kind) | (times * (TILE * TILE + _RANGE_BYTES) <= network)
-    return chosen & (profile.frames != "never")
+    smaller = times * (TILE * TILE + _RANGE_BYTES) <= tile_bytes(profile)
+    return (kinds == TileKind.DYNAMIC) & (profile.frames == "always" or (profile.frames == "auto" and smaller))
 
 
 def encode_frames(colour: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -134,8 +130,7 @@ class FrameTiles(DeviceTiles):
 class Frames(Encoding):
     """Stores a tile as BC7 blocks at each time."""
 
-    kinds = (TileKind.FRAMES,)
-    codes = (3,)
+    kind = TileKind.FRAMES
 
     def packed_size(self, sheet: SheetModel, number: int) -> int:
         return len(sheet.times) * TILE * TILE

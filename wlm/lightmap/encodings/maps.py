@@ -1,4 +1,4 @@
-"""Encoding of tiles as feature maps and a network; static tiles have F_uv, dynamic tiles F_uv, F_uvt, F_ut and F_vt.
+"""Encoding of dynamic tiles as the feature maps F_uv, F_uvt, F_ut and F_vt and a network.
 
 In the file each tile is one zstd frame (`wlm.lightmap.codec`) of its maps, as a GPU holds them, and its network.
 """
@@ -21,38 +21,36 @@ from wlm.lightmap.profile import Profile
 from wlm.lightmap.tiles import TILE, TileKind
 from wlm_kernels import mlp
 from wlm_kernels.lightmap import decode as decode_kernels
+from wlm_kernels.lightmap.features import INPUTS, MAP_INPUTS
 from wlm_kernels.lightmap.levels import LEVELS
 
 _SQRT_12 = math.sqrt(12.0)  # features in [0, 1] enter the network as (f - 1/2) sqrt(12)
 _MODE_BITS, _MODE_6 = 127, 64  # of the first byte of a BC7 block, and their value in mode 6
-_MAPS, _TEMPORAL = 4, 12  # network inputs from textures, of static and of dynamic tiles; the encoded time follows
 
 
 # ---- sizes ----
 
 
-def tile_bytes(profile: Profile, temporal: bool) -> int:
+def tile_bytes(profile: Profile) -> int:
     """Returns the bytes of the maps and the network of one tile before packing (neural-dynamic-gi, table 3)."""
-    inputs, hidden = profile.inputs(temporal), profile.hidden
-    if profile.net_bits == 16:
-        size = TILE * TILE + 2 * mlp.parameter_count(inputs, hidden)
-    else:
-        size = TILE * TILE + (inputs + hidden + 3) * hidden + 2 * 2 * (2 * hidden + 3)
-    if temporal:
-        size += profile.uvt_slices * profile.uvt_resolution**2 + 2 * 2 * profile.plane_rows * profile.plane_columns
-    return size
+    hidden = profile.hidden
+    network = 2 * mlp.parameter_count(INPUTS, hidden)
+    if profile.net_bits == 8:
+        network = (INPUTS + hidden + 3) * hidden + 2 * 2 * (2 * hidden + 3)
+    planes = 2 * 2 * profile.plane_rows * profile.plane_columns
+    return TILE * TILE + profile.uvt_slices * profile.uvt_resolution**2 + planes + network
 
 
 # ---- bytes of a tile in the file ----
 
 
-def check_packable(parts: Mapping[str, np.ndarray], profile: Profile, dynamic: bool) -> None:
+def check_packable(parts: Mapping[str, np.ndarray], profile: Profile) -> None:
     """Raises WlmError unless a trainer's maps are BC7 mode 6 and its weights are exact in the profile's `net_bits`."""
-    for name in ("uv", "uvt") if dynamic else ("uv",):
+    for name in ("uv", "uvt"):
         _check_mode(parts[name])
     if profile.net_bits == 8:
         for net in parts["net"]:
-            pack_network(net, profile.inputs(dynamic), profile.hidden)
+            pack_network(net, profile.hidden)
 
 
 def _check_mode(blocks: np.ndarray) -> None:
@@ -60,7 +58,7 @@ def _check_mode(blocks: np.ndarray) -> None:
         raise WlmError("maps: expected BC7 blocks of mode 6, found another mode")
 
 
-def pack_network(net: np.ndarray, inputs: int, hidden: int) -> np.ndarray:
+def pack_network(net: np.ndarray, hidden: int) -> np.ndarray:
     """Packs a network with 8-bit weights into bytes: the integer weights, then the largest magnitudes and the biases.
 
     The weights into one unit share the largest magnitude m among them, a half float; a weight is q m / 127 with an
@@ -68,7 +66,7 @@ def pack_network(net: np.ndarray, inputs: int, hidden: int) -> np.ndarray:
     (`wlm_kernels.lightmap.levels`), so that the file loses nothing; a weight that is not on its level is a `WlmError`.
     """
     whole, halves = [], []
-    for weights, bias in _layers(net, inputs, hidden):
+    for weights, bias in _layers(net, hidden):
         most = np.abs(weights).max(0)
         step = most.astype(np.float32) / np.float32(LEVELS)
         q = np.rint(np.divide(weights, step, out=np.zeros(weights.shape, np.float32), where=step > 0))
@@ -79,9 +77,9 @@ def pack_network(net: np.ndarray, inputs: int, hidden: int) -> np.ndarray:
     return np.concatenate([np.concatenate(whole).view(np.uint8), np.concatenate(halves).view(np.uint8)])
 
 
-def unpack_network(data: np.ndarray, inputs: int, hidden: int) -> np.ndarray:
+def unpack_network(data: np.ndarray, hidden: int) -> np.ndarray:
     """Inverts `pack_network`: converts its bytes to the network's parameters, float16 [P]."""
-    shapes = (inputs, hidden), (hidden, hidden), (hidden, 3)
+    shapes = (INPUTS, hidden), (hidden, hidden), (hidden, 3)
     count = sum(rows * units for rows, units in shapes)
     whole, halves = data[:count].view(np.int8), data[count:].view("<f2")
     parts, at, place = [], 0, 0
@@ -95,36 +93,41 @@ def unpack_network(data: np.ndarray, inputs: int, hidden: int) -> np.ndarray:
     return np.concatenate(parts).astype(np.float16)
 
 
-def _layers(net: np.ndarray, inputs: int, hidden: int) -> list[tuple[np.ndarray, np.ndarray]]:
-    split = (inputs + hidden + 2) * hidden
-    rows, output = net[:split].reshape(-1, hidden), net[split:].reshape(-1, 3)
-    return [(rows[:inputs], rows[inputs]), (rows[inputs + 1 : -1], rows[-1]), (output[:-1], output[-1])]
+def _layers(net: np.ndarray, hidden: int) -> list[tuple[np.ndarray, np.ndarray]]:
+    rows, output = split_networks(net, hidden)
+    return [(rows[:INPUTS], rows[INPUTS]), (rows[INPUTS + 1 : -1], rows[-1]), (output[:-1], output[-1])]
+
+
+def split_networks(nets: np.ndarray, hidden: int) -> tuple[np.ndarray, np.ndarray]:
+    """Splits the parameters of networks, [..., P], into hidden layers [..., 18 + H, H] and output layers
+    [..., H + 1, 3], see `wlm_kernels.mlp`."""
+    split = (INPUTS + hidden + 2) * hidden
+    return nets[..., :split].reshape(*nets.shape[:-1], -1, hidden), nets[..., split:].reshape(*nets.shape[:-1], -1, 3)
 
 
 # ---- tiles on a device ----
 
 
 class MapTiles(DeviceTiles):
-    """The static or the dynamic tiles of a sheet on a device.
+    """The dynamic tiles of a sheet on a device.
 
     `places`, int [n] on the device, 0 to n - 1, are indices of the tiles in the arrays of a `TimeState`; `arguments`
     are the first arguments of each decode kernel: `Stored` and the networks, see `wlm_kernels.mlp`.
     """
 
-    def __init__(self, sheet: SheetModel, kind: TileKind, device: str, gelu: str) -> None:
-        """Uploads the tiles of a kind, DYNAMIC or STATIC."""
-        profile, dynamic = sheet.profile, kind == TileKind.DYNAMIC
-        rows = np.flatnonzero(sheet.kind[sheet.mapped] == kind)
-        if not len(rows):
-            raise WlmError(f"{sheet.name}: expected at least one {kind.name.lower()} tile, found none")
-        super().__init__(sheet.mapped[rows])
+    def __init__(self, sheet: SheetModel, device: str, gelu: str) -> None:
+        """Uploads the dynamic tiles of a sheet."""
+        profile = sheet.profile
+        super().__init__(sheet.numbers(TileKind.DYNAMIC))
+        if not len(self.numbers):
+            raise WlmError(f"{sheet.name}: expected at least one dynamic tile, found none")
         self.model, self._device = sheet, device
-        self._axis, self._scale = sheet.axis, sheet.scales[rows]
-        self._peak = decode_scale(sheet.peak[rows], profile.gamma)
-        affine = np.ascontiguousarray(sheet.affine[rows].astype(np.float32).swapaxes(0, 1))
+        self._axis, self._scale = sheet.axis, sheet.scales
+        self._peak = decode_scale(sheet.peak, profile.gamma)
+        affine = np.ascontiguousarray(sheet.affine.astype(np.float32).swapaxes(0, 1))
         self._shift, self._spread = (wp.array(values, dtype=wp.vec3, device=device) for values in affine)
-        self.places = wp.array(np.arange(len(rows), dtype=np.int32), dtype=int, device=device)
-        self._kernels = decode_kernels.exact_kernels(dynamic, profile.hidden, gelu)
+        self.places = wp.array(np.arange(len(self.numbers), dtype=np.int32), dtype=int, device=device)
+        self._kernels = decode_kernels.exact_kernels(profile.hidden, gelu)
 
         def blocks(values: np.ndarray) -> wp.array:
             words = np.ascontiguousarray(values).view("<u8")
@@ -132,17 +135,12 @@ class MapTiles(DeviceTiles):
 
         stored = decode_kernels.Stored()
         stored.slices, stored.periodic = profile.uvt_slices, int(self._axis.periodic)
-        maps = {"uv": blocks(sheet.uv[rows])}
-        if dynamic:
-            maps["uvt"] = blocks(sheet.uvt)
-            for name in ("ut", "vt"):
-                maps[name] = wp.array(np.ascontiguousarray(getattr(sheet, name)), dtype=wp.vec2ub, device=device)
+        maps = {"uv": blocks(sheet.uv), "uvt": blocks(sheet.uvt)}
+        for name in ("ut", "vt"):
+            maps[name] = wp.array(np.ascontiguousarray(getattr(sheet, name)), dtype=wp.vec2ub, device=device)
         for name, values in maps.items():
             setattr(stored, name, values)
-        net = (sheet.net if dynamic else sheet.net_static).astype(np.float32)
-        split = (profile.inputs(dynamic) + profile.hidden + 2) * profile.hidden
-        hidden = np.ascontiguousarray(net[:, :split]).reshape(len(net), -1, profile.hidden)
-        output = np.ascontiguousarray(net[:, split:]).reshape(len(net), -1, 3)
+        hidden, output = map(np.ascontiguousarray, split_networks(sheet.net.astype(np.float32), profile.hidden))
         hidden = wp.array(hidden, dtype=wp.types.vector(profile.hidden, float), device=device)
         output = wp.array(output, dtype=wp.vec3, device=device)
         self.arguments = (stored, hidden, output)
@@ -203,61 +201,44 @@ def shader_networks(sheet: SheetModel) -> np.ndarray:
     """Returns all networks as the shader reads them, float32 [n, 4]: weights W and bias b of layers 1 to 3, one row of
     W per input; `network_starts` says where each network begins.
 
-    Dynamic tiles come first, then static ones. Rows are padded with zeros to groups of four, and so are the inputs of
-    the next layer. The shader passes features f as the textures hold them: their centring, (f - 1/2) sqrt(12), is part
-    of W1 and b1.
+    Rows are padded with zeros to groups of four, and so are the inputs of the next layer. The shader passes features f
+    as the textures hold them: their centring, (f - 1/2) sqrt(12), is part of W1 and b1.
     """
     hidden, wide = sheet.profile.hidden, 4 * fours(sheet.profile)
     made = [np.zeros((0, 4), np.float32)]
-    for nets, centred in ((sheet.net, _TEMPORAL), (sheet.net_static, _MAPS)):
-        for net in nets:
-            count = len(net) - 3 * (hidden + 1)
-            layers, output = net[:count].astype(np.float64).reshape(-1, hidden), net[count:].reshape(-1, 3)
-            inputs = len(layers) - hidden - 2
-            # W (f - 1/2) sqrt(12) + b = (sqrt(12) W) f + (b - sqrt(12)/2 W 1).
-            layers[:centred] *= _SQRT_12
-            layers[inputs] -= 0.5 * layers[:centred].sum(0)
-            added = wide - hidden
-            layers = np.insert(layers, np.full(added, len(layers) - 1), 0.0, axis=0)
-            output = np.insert(output.astype(np.float64), np.full(added, hidden), 0.0, axis=0)
-            rows = np.pad(layers, ((0, 0), (0, added))).reshape(-1, 4), np.pad(output, ((0, 0), (0, 1)))
-            made += [part.astype(np.float32) for part in rows]
+    for net in sheet.net.astype(np.float64):
+        layers, output = split_networks(net, hidden)
+        # W (f - 1/2) sqrt(12) + b = (sqrt(12) W) f + (b - sqrt(12)/2 W 1).
+        layers[:MAP_INPUTS] *= _SQRT_12
+        layers[INPUTS] -= 0.5 * layers[:MAP_INPUTS].sum(0)
+        added = wide - hidden
+        layers = np.insert(layers, np.full(added, len(layers) - 1), 0.0, axis=0)
+        output = np.insert(output, np.full(added, hidden), 0.0, axis=0)
+        rows = np.pad(layers, ((0, 0), (0, added))).reshape(-1, 4), np.pad(output, ((0, 0), (0, 1)))
+        made += [part.astype(np.float32) for part in rows]
     return np.concatenate(made)
 
 
-def network_starts(sheet: SheetModel) -> np.ndarray:
-    """Returns each network's first row in `shader_networks`, int [N_m], in the order of the tiles."""
-    wide = fours(sheet.profile)
-    sizes = [
-        np.full(len(nets), (sheet.profile.inputs(temporal) + 4 * wide + 2) * wide + 4 * wide + 1)
-        for nets, temporal in ((sheet.net, True), (sheet.net_static, False))
-    ]
-    return np.concatenate([[0], np.cumsum(np.concatenate(sizes))])[:-1].astype(int)
-
-
-def image_rows(sheet: SheetModel) -> np.ndarray:
-    """Returns for each tile with maps the index of its image in the textures, dynamic tiles first, int [N_m]."""
-    static = sheet.kind[sheet.mapped] == TileKind.STATIC
-    rows = np.empty(len(static), int)
-    rows[np.argsort(static, kind="stable")] = np.arange(len(static))
-    return rows
+def network_fours(profile: Profile) -> int:
+    """Returns the rows of each network in `shader_networks`."""
+    wide = fours(profile)
+    return (INPUTS + 4 * wide + 2) * wide + 4 * wide + 1
 
 
 class Maps(Encoding):
     """Stores a tile as feature maps and a network."""
 
-    kinds = (TileKind.STATIC, TileKind.DYNAMIC)
-    codes = (1, 2)
+    kind = TileKind.DYNAMIC
 
     def packed_size(self, sheet: SheetModel, number: int) -> int:
-        return tile_bytes(sheet.profile, bool(sheet.kind[number] == TileKind.DYNAMIC))
+        return tile_bytes(sheet.profile)
 
     def pack(self, sheet: SheetModel, number: int) -> bytes:
         net, maps = self._arrays(sheet, number)
         for blocks in maps[:2]:
             _check_mode(blocks)
         if sheet.profile.net_bits == 8:
-            net = pack_network(net, sheet.profile.inputs(len(maps) > 1), sheet.profile.hidden)
+            net = pack_network(net, sheet.profile.hidden)
         return b"".join(part.tobytes() for part in (*maps, net))
 
     def unpack(self, sheet: SheetModel, number: int, data: np.ndarray) -> None:
@@ -269,63 +250,53 @@ class Maps(Encoding):
         for blocks in maps[:2]:
             _check_mode(blocks)
         rest, profile = data[at:], sheet.profile
-        wide = profile.net_bits == 16
-        net[:] = rest.view("<f2") if wide else unpack_network(rest, profile.inputs(len(maps) > 1), profile.hidden)
+        net[:] = rest.view("<f2") if profile.net_bits == 16 else unpack_network(rest, profile.hidden)
         if not np.isfinite(net).all():
             raise ValueError("expected finite numbers in the network, found NaN or infinity")
 
     def _arrays(self, sheet: SheetModel, number: int) -> tuple[np.ndarray, list[np.ndarray]]:
         """Returns the network of a tile, and its maps in their order in the file, as views of a sheet's arrays."""
-        row, uv = sheet.row(number), sheet.uv[sheet.map_row(number)]
-        if sheet.kind[number] == TileKind.STATIC:
-            return sheet.net_static[row], [uv]
-        return sheet.net[row], [uv, sheet.uvt[row], sheet.ut[row], sheet.vt[row]]
+        row = sheet.row(number)
+        return sheet.net[row], [sheet.uv[row], sheet.uvt[row], sheet.ut[row], sheet.vt[row]]
 
     def upload(self, sheet: SheetModel, device: str, gelu: str) -> list[DeviceTiles]:
-        kinds = [kind for kind in (TileKind.DYNAMIC, TileKind.STATIC) if (sheet.kind == kind).any()]
-        return [MapTiles(sheet, kind, device, gelu) for kind in kinds]
+        return [MapTiles(sheet, device, gelu)] if len(sheet.net) else []
 
     def textures(self, sheet: SheetModel) -> dict[str, Texture]:
-        profile, made = sheet.profile, {}
-        if len(sheet.uv):
-            order = np.argsort(image_rows(sheet))
-            made["uv"] = Texture(**side_by_side(sheet.uv[order], "BC7_UNORM", TILE, TILE))
-        if len(sheet.uvt):
-            side, slices = profile.uvt_resolution, sheet.uvt.reshape(-1, *sheet.uvt.shape[2:])
-            made["uvt"] = Texture(**side_by_side(slices, "BC7_UNORM", side, side))
-            planes = np.stack([sheet.ut, sheet.vt], 1).reshape(-1, *sheet.ut.shape[1:])
-            size = profile.plane_rows, profile.plane_columns
-            made["planes"] = Texture(**side_by_side(planes, "R8G8_UNORM", *size))
-        return made
+        if not len(sheet.uv):
+            return {}
+        side, slices = sheet.profile.uvt_resolution, sheet.uvt.reshape(-1, *sheet.uvt.shape[2:])
+        planes = np.stack([sheet.ut, sheet.vt], 1).reshape(-1, *sheet.ut.shape[1:])
+        made = {
+            "uv": side_by_side(sheet.uv, "BC7_UNORM", TILE, TILE),
+            "uvt": side_by_side(slices, "BC7_UNORM", side, side),
+            "planes": side_by_side(planes, "R8G8_UNORM", *planes.shape[1:3]),
+        }
+        return {name: Texture(**texture) for name, texture in made.items()}
 
     def describe(self, sheet: SheetModel, number: int) -> dict[str, Any]:
-        at = sheet.map_row(number)
-        image = int(image_rows(sheet)[at])
-        shift, spread = sheet.affine[at]
+        row, gamma = sheet.row(number), sheet.profile.gamma
+        shift, spread = sheet.affine[row]
         return {
-            "image": image,
+            "image": row,
             "shift": rounded(shift),
             "spread": rounded(spread),
-            "scale": rounded(sheet.scales[at]),
-            "peak": rounded(decode_scale(sheet.peak[at], sheet.profile.gamma)),
-            "network_four": int(network_starts(sheet)[image]),
+            "scale": rounded(decode_scale(sheet.scale[row], gamma)),
+            "peak": rounded(decode_scale(sheet.peak[row], gamma)),
+            "network_four": row * network_fours(sheet.profile),
         }
 
     def fill_records(self, sheet: SheetModel, times: Sequence[float], records: np.ndarray) -> None:
         axis, wide = sheet.axis, fours(sheet.profile)
-        weights, starts = shader_networks(sheet), network_starts(sheet)
+        weights = shader_networks(sheet).astype(np.float64)
         scales, affine = sheet.scales.astype(np.float64), sheet.affine.astype(np.float64)
-        for place, (number, image) in enumerate(zip(sheet.mapped, image_rows(sheet), strict=True)):
-            start, (shift, spread) = int(starts[image]), affine[place]
-            temporal = sheet.kind[number] == TileKind.DYNAMIC
-            inputs, encoded = (_TEMPORAL, 4) if temporal else (_MAPS, 0)
-            layer = weights[start + inputs * wide : start + (inputs + encoded + 1) * wide].astype(np.float64)
-            layer = layer.reshape(-1, wide, 4)
+        for row, number in enumerate(sheet.numbers(TileKind.DYNAMIC)):
+            start, (shift, spread) = row * network_fours(sheet.profile), affine[row]
+            layer = weights[start + MAP_INPUTS * wide : start + (INPUTS + 1) * wide].reshape(-1, wide, 4)
             for table, time in zip(records, times, strict=True):
                 before, after, share = axis.neighbours(time)
-                scale = (1.0 - share) * scales[place, before] + share * scales[place, after]
+                scale = (1.0 - share) * scales[row, before] + share * scales[row, after]
                 record = table[number]
-                record[0, 1:3] = image, start
+                record[0, 1:3] = row, start
                 record[1, :3], record[2, :3] = shift * scale, spread * scale
-                code = axis.encode(time).astype(np.float64)[:encoded]
-                record[3 : 3 + wide] = layer[-1] + np.tensordot(code, layer[:-1], 1)
+                record[3 : 3 + wide] = layer[-1] + np.tensordot(axis.encode(time).astype(np.float64), layer[:-1], 1)

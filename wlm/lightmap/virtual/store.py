@@ -18,6 +18,7 @@ import warp as wp
 from wlm.errors import WlmError
 from wlm.formats.shared_exponent import unpack_rgb9e5
 from wlm.lightmap.encodings.frames import bc7_tables
+from wlm.lightmap.encodings.maps import split_networks
 from wlm.lightmap.loading import TileLoader
 from wlm.lightmap.model import BLOCKS, PACKED_KINDS, LightmapModel, SheetModel
 from wlm.lightmap.sheet import Sheet
@@ -30,7 +31,7 @@ from wlm_kernels.lightmap import decode as decode_kernels
 from wlm_kernels.lightmap import frames as frame_kernels
 from wlm_kernels.lightmap import matrix_pages
 from wlm_kernels.lightmap import pages as kernels
-from wlm_kernels.lightmap.features import STATIC_INPUTS, TEMPORAL_INPUTS
+from wlm_kernels.lightmap.features import INPUTS
 from wlm_kernels.lightmap.matrix_decode import pack_biases, pack_networks, packed_words
 from wlm_kernels.lightmap.virtual import KEEP
 
@@ -193,23 +194,19 @@ class TileStore:
                     raise WlmError(f"tiles: expected at least {needed} bytes for the tiles of a page, got {room}")
                 slots = least
         pools = {kind: _Pool(shapes[kind], slots[kind], self._device) for kind in PACKED_KINDS}
-        moving, still = (
-            (self._mapped(own, pools[kind].arrays), *(pools[kind].arrays[name] for name in ("first", "later")))
-            for kind in (TileKind.DYNAMIC, TileKind.STATIC)
-        )
+        maps = pools[TileKind.DYNAMIC].arrays
         frames = frame_kernels.StoredFrames()
         for name, array in pools[TileKind.FRAMES].arrays.items():
             setattr(frames, name, array)
         frames.tables, frames.times, frames.gamma = bc7_tables(self._device), times, 1.0  # the gamma is the sheet's
-        self._stored = (*moving, *still, frames)
+        self._stored = (self._mapped(own, maps), maps["first"], maps["later"], frames)
         return pools
 
     def _mapped(self, own: SheetModel, arrays: dict[str, wp.array]) -> kernels.Mapped:
         stored, mapped = decode_kernels.Stored(), kernels.Mapped()
         stored.slices, stored.periodic = own.profile.uvt_slices, int(own.axis.periodic)
         for name in ("uv", "uvt", "ut", "vt"):
-            if name in arrays:
-                setattr(stored, name, arrays[name])
+            setattr(stored, name, arrays[name])
         mapped.stored = stored
         for name in ("scale", "shift", "spread"):
             setattr(mapped, name, arrays[name])
@@ -474,24 +471,23 @@ def _shapes(own: SheetModel, matrix: bool) -> dict[int, dict[str, tuple[Any, tup
     h, r = profile.hidden, profile.uvt_resolution // 4
     plane = (wp.vec2ub, (1, profile.plane_rows, profile.plane_columns))
 
-    def mapped(temporal: bool) -> dict[str, tuple[Any, tuple[int, ...]]]:
-        rows = 5 if matrix else profile.inputs(temporal) + h + 2
-        return {
-            "uv": (wp.uint64, (1, BLOCKS, BLOCKS, 2)),
-            "first": (wp.types.vector(h, float), (1, rows)),
-            "later": (wp.uint32, (1, packed_words(h))) if matrix else (wp.vec3, (1, h + 1)),
-            "scale": (wp.vec3, (1, times)),
-            "shift": (wp.vec3, (1,)),
-            "spread": (wp.vec3, (1,)),
-        }
-
-    temporal = {"uvt": (wp.uint64, (profile.uvt_slices, r, r, 2)), "ut": plane, "vt": plane}
+    dynamic = {
+        "uv": (wp.uint64, (1, BLOCKS, BLOCKS, 2)),
+        "first": (wp.types.vector(h, float), (1, 5 if matrix else INPUTS + h + 2)),
+        "later": (wp.uint32, (1, packed_words(h))) if matrix else (wp.vec3, (1, h + 1)),
+        "scale": (wp.vec3, (1, times)),
+        "shift": (wp.vec3, (1,)),
+        "spread": (wp.vec3, (1,)),
+        "uvt": (wp.uint64, (profile.uvt_slices, r, r, 2)),
+        "ut": plane,
+        "vt": plane,
+    }
     frames = {
         "blocks": (wp.uint64, (times, BLOCKS, BLOCKS, 2)),
         "least": (wp.vec3, (times,)),
         "span": (wp.vec3, (times,)),
     }
-    return {TileKind.DYNAMIC: mapped(True) | temporal, TileKind.STATIC: mapped(False), TileKind.FRAMES: frames}
+    return {TileKind.DYNAMIC: dynamic, TileKind.FRAMES: frames}
 
 
 def _rows(part: SheetModel, kind: int, matrix: bool) -> dict[str, np.ndarray]:
@@ -499,19 +495,15 @@ def _rows(part: SheetModel, kind: int, matrix: bool) -> dict[str, np.ndarray]:
     if kind == TileKind.FRAMES:
         ends = part.ranges.astype(np.float32)
         return {"blocks": part.frames, "least": ends[:, :, 0], "span": ends[:, :, 1] - ends[:, :, 0]}
-    dynamic, profile = kind == TileKind.DYNAMIC, part.profile
-    net = (part.net if dynamic else part.net_static).astype(np.float32)
-    split = (profile.inputs(dynamic) + profile.hidden + 2) * profile.hidden
-    first, later = net[:, :split], net[:, split:]
+    first, later = split_networks(part.net.astype(np.float32), part.profile.hidden)
     if matrix:
-        hidden = first.reshape(len(net), -1, profile.hidden)
-        if not dynamic:  # the inputs that static tiles lack have no weights
-            hidden = np.insert(hidden, [STATIC_INPUTS] * (TEMPORAL_INPUTS - STATIC_INPUTS), 0.0, axis=1)
-        first, later = pack_biases(hidden), pack_networks(hidden, later.reshape(len(net), -1, 3))
+        first, later = pack_biases(first), pack_networks(first, later)
     affine = part.affine.astype(np.float32)
-    maps = {"uvt": part.uvt, "ut": part.ut, "vt": part.vt} if dynamic else {}
-    return maps | {
+    return {
         "uv": part.uv,
+        "uvt": part.uvt,
+        "ut": part.ut,
+        "vt": part.vt,
         "first": first,
         "later": later,
         "scale": part.scales,

@@ -47,7 +47,7 @@ function wlmTable(lightmap, networks, now) {
   put(0, wlmBetween(now.tau, lightmap.slices, axis.repeats).slice(0, 3), columns);
   if (images.planes) put(1, wlmBetween(now.tau, images.planes.size[1], axis.repeats));
   for (const tile of lightmap.tiles) {
-    const at = 2 + record * tile.number, codes = {constant: 0, static: 1, dynamic: 2, frames: 3};
+    const at = 2 + record * tile.number, codes = {constant: 1, dynamic: 3, frames: 4};
     put(at, codes[tile.kind], tile.image ?? 0, tile.network_four ?? 0, 0);
     if (tile.kind === 'constant') {
       put(at + 1, mixed(tile.radiance).map((v) => v ** (1 / lightmap.gamma)));
@@ -60,8 +60,8 @@ function wlmTable(lightmap, networks, now) {
       const scale = mixed(tile.scale), turn = axis.turn * now.tau;
       put(at + 1, tile.shift.map((v, c) => v * scale[c]));
       put(at + 2, tile.spread.map((v, c) => v * scale[c]));
-      const time = tile.kind === 'dynamic' ? [turn, 2 * turn].flatMap((a) => [Math.sin(a), Math.cos(a)]) : [];
-      const first = 4 * (tile.network_four + (tile.kind === 'dynamic' ? 12 : 4) * wide), row = 4 * wide;
+      const time = [turn, 2 * turn].flatMap((a) => [Math.sin(a), Math.cos(a)]);
+      const first = 4 * (tile.network_four + 12 * wide), row = 4 * wide;
       for (let j = 0; j < row; ++j) {
         let bias = networks[first + time.length * row + j];
         time.forEach((v, c) => { bias += v * networks[first + c * row + j]; });

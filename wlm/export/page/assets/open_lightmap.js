@@ -1,7 +1,8 @@
 // Makes the content of a page from a file of lightmaps, as wlm/lightmap/codec.py, encodings and bundle.py do together: the
 // light groups of its first sheet of light.
 
-const TILE = 128, LIGHTMAP_KINDS = ['empty', 'constant', 'static', 'dynamic', 'frames'];
+const TILE = 128, LIGHTMAP_KINDS = {empty: 0, constant: 1, dynamic: 3, frames: 4};
+const INPUTS = 16, MAP_INPUTS = 12;  // of a network, and those of them that come from the maps
 const SCALE_SPAN = [-21, 16];  // of codes, as log2 of radiance
 const VALUE_RANGES = {unit: [0, 1], signed: [-1, 1]};
 const recordFours = (profile) => 3 + Math.max(Math.ceil(profile.hidden / 4), 2);
@@ -9,7 +10,7 @@ const recordFours = (profile) => 3 + Math.max(Math.ceil(profile.hidden / 4), 2);
 // Settings of the fit of a sheet: sizes along time follow the number of times, and values that are no light have no gamma.
 function sheetProfile(profile, times, encoding) {
   const made = {...profile};
-  if (profile.follow_times) {
+  if (profile.follow_times || times === 1) {
     const even = (x) => Math.round(x) - (x % 1 === 0.5 && Math.round(x) % 2 ? 1 : 0);
     for (const name of ['uvt_slices', 'plane_rows']) {
       made[name] = Math.min(times, 64, Math.max(profile[name], even(profile[name] * times / 26)));
@@ -33,9 +34,9 @@ function sideBySide(images, rows, height, width) {
 }
 
 // The numbers of a network of a tile: half floats, or weights of 8 bits with a largest magnitude for each unit.
-function unpackNetwork(bytes, inputs, hidden, bits) {
+function unpackNetwork(bytes, hidden, bits) {
   if (bits === 16) return halves(numbersOf(bytes, Uint16Array));
-  const shapes = [[inputs, hidden], [hidden, hidden], [hidden, 3]], count = shapes.reduce((sum, [a, b]) => sum + a * b, 0);
+  const shapes = [[INPUTS, hidden], [hidden, hidden], [hidden, 3]], count = shapes.reduce((sum, [a, b]) => sum + a * b, 0);
   const whole = numbersOf(bytes.subarray(0, count), Int8Array), rest = halves(numbersOf(bytes.subarray(count), Uint16Array));
   const numbers = [];
   let at = 0, place = 0;
@@ -51,15 +52,15 @@ function unpackNetwork(bytes, inputs, hidden, bits) {
 }
 
 // A network as the shader reads it: rows of fours, with the centring of the maps in the first layer.
-function shaderNetwork(net, inputs, centred, hidden) {
+function shaderNetwork(net, hidden) {
   const wide = 4 * Math.ceil(hidden / 4), root = Math.sqrt(12), rows = [];
-  for (let i = 0; i < inputs + hidden + 2; ++i) rows.push(Array.from(net.slice(i * hidden, (i + 1) * hidden)));
+  for (let i = 0; i < INPUTS + hidden + 2; ++i) rows.push(Array.from(net.slice(i * hidden, (i + 1) * hidden)));
   for (let k = 0; k < hidden; ++k) {
     let sum = 0;
-    for (let i = 0; i < centred; ++i) sum += rows[i][k] *= root;
-    rows[inputs][k] -= 0.5 * sum;
+    for (let i = 0; i < MAP_INPUTS; ++i) sum += rows[i][k] *= root;
+    rows[INPUTS][k] -= 0.5 * sum;
   }
-  const output = Array.from({length: hidden + 1}, (_, i) => Array.from(net.slice((inputs + hidden + 2) * hidden + 3 * i).slice(0, 3)));
+  const output = Array.from({length: hidden + 1}, (_, i) => Array.from(net.slice((INPUTS + hidden + 2) * hidden + 3 * i).slice(0, 3)));
   for (let i = hidden; i < wide; ++i) {
     rows.splice(-1, 0, Array(hidden).fill(0));
     output.splice(-1, 0, [0, 0, 0]);
@@ -82,23 +83,21 @@ function openGroup(artifact, number, times, profile, templates) {
   const columns = Math.ceil(width / TILE), count = columns * Math.ceil(height / TILE), T = times.length;
   const part = (name, type, many) => partNumbers(parts, `${number}.${name}`, [type].flat(), many);
   const kind = part('kind', 'U8', count), of = (...kinds) => Array.from(kind.keys()).filter((i) => kinds.includes(kind[i]));
-  if (kind.some((each) => each > 4)) throw new Error(`part ${number}.kind: expected kinds of tiles from 0 to 4`);
-  const mapped = of(2, 3), dynamic = of(3), framed = of(4), constant = of(1), packed = of(2, 3, 4);
+  if (kind.some((each) => each === 2 || each > 4)) throw new Error(`part ${number}.kind: expected the kinds of tiles 0, 1, 3 and 4`);
+  const dynamic = of(3), framed = of(4), constant = of(1), packed = of(3, 4);
   const own = pieces[`${number}.tiles`] ?? [];
   if (own.length !== packed.length) throw new Error(`part ${number}.tiles: expected ${packed.length} pieces, found ${own.length}`);
   const {hidden, uvt_resolution: side, uvt_slices: slices, plane_rows: rows, plane_columns: across, net_bits: bits, gamma} = profile;
-  const parameters = (inputs) => bits === 16 ? 2 * ((inputs + hidden + 2) * hidden + 3 * (hidden + 1))
-    : (inputs + hidden + 3) * hidden + 4 * (2 * hidden + 3);
+  const parameters = bits === 16 ? 2 * ((INPUTS + hidden + 2) * hidden + 3 * (hidden + 1))
+    : (INPUTS + hidden + 3) * hidden + 4 * (2 * hidden + 3);
   const plane = 2 * rows * across, volume = slices * side * side;
   const tiles = new Map(packed.map((tile, i) => {
-    const changing = kind[tile] === 3, inputs = changing ? 16 : 4;
-    const bytes = TILE * TILE * (kind[tile] === 4 ? T : 1) + (kind[tile] === 4 ? 0 : parameters(inputs) + (changing ? volume + 2 * plane : 0));
-    const data = unzstd(own[i], bytes);
+    const data = unzstd(own[i], kind[tile] === 4 ? TILE * TILE * T : TILE * TILE + volume + 2 * plane + parameters);
     if (kind[tile] === 4) return [tile, {frames: data}];
     let at = 0;
     const take = (size) => data.subarray(at, at += size);
-    const maps = {uv: take(TILE * TILE), ...changing && {uvt: take(volume), ut: take(plane), vt: take(plane)}};
-    return [tile, {...maps, net: shaderNetwork(unpackNetwork(data.subarray(at), inputs, hidden, bits), inputs, changing ? 12 : 4, hidden)}];
+    const maps = {uv: take(TILE * TILE), uvt: take(volume), ut: take(plane), vt: take(plane)};
+    return [tile, {...maps, net: shaderNetwork(unpackNetwork(data.subarray(at), hidden, bits), hidden)}];
   }));
   const textures = {}, arrays = {}, images = {};
   const put = (name, made, sizes, layers = 0) => {
@@ -106,10 +105,9 @@ function openGroup(artifact, number, times, profile, templates) {
     textures[name] = {size: made.size, layers};
     images[name] = {size: sizes, across: made.across};
   };
-  // Dynamic tiles come first.
-  const order = [...dynamic, ...of(2)], each = (name) => order.map((tile) => tiles.get(tile)[name]).filter(Boolean);
-  if (order.length) put('uv', sideBySide(each('uv'), TILE / 4, TILE, TILE), [TILE, TILE]);
+  const each = (name) => dynamic.map((tile) => tiles.get(tile)[name]);
   if (dynamic.length) {
+    put('uv', sideBySide(each('uv'), TILE / 4, TILE, TILE), [TILE, TILE]);
     const sheet = each('uvt').flatMap((map) => Array.from({length: slices}, (_, i) => map.subarray(side * side * i, side * side * (i + 1))));
     put('uvt', sideBySide(sheet, side / 4, side, side), [side, side]);
     const pairs = dynamic.flatMap((tile) => [tiles.get(tile).ut, tiles.get(tile).vt]);
@@ -128,23 +126,22 @@ function openGroup(artifact, number, times, profile, templates) {
   const threes = (values, row, amount = T) => Array.from({length: amount}, (_, i) => Array.from(values.slice(3 * (row * amount + i), 3 * (row * amount + i) + 3)));
   const [low, high] = SCALE_SPAN.map((bound) => bound / gamma);
   const scale = part('scale', 'U8', dynamic.length * T * 3), decoded = Array.from(scale, (code) => code ? Math.fround(2 ** (low + (code - 1) * (high - low) / 254)) : 0);
-  const still = halves(part('scale_static', 'F16', of(2).length * T * 3)), affine = halves(part('affine', 'F16', mapped.length * 6));
+  const affine = halves(part('affine', 'F16', dynamic.length * 6));
   const ranges = halves(part('ranges', 'F16', framed.length * T * 6));
   const colours = part('constant', ['F16', 'F32'], constant.length * T * 3), steady = colours instanceof Uint16Array ? halves(colours) : colours;
-  const starts = networks.reduce((all, net) => [...all, all.at(-1) + net.length / 4], [0]);
   const described = packed.concat(constant).map((tile) => {
-    const at = {number: tile, kind: LIGHTMAP_KINDS[kind[tile]], column: tile % columns, row: Math.floor(tile / columns)};
+    const name = Object.keys(LIGHTMAP_KINDS).find((each) => LIGHTMAP_KINDS[each] === kind[tile]);
+    const at = {number: tile, kind: name, column: tile % columns, row: Math.floor(tile / columns)};
     if (kind[tile] === 1) return {...at, radiance: threes(steady, constant.indexOf(tile))};
     if (kind[tile] === 4) {
       const pairs = threes(ranges, framed.indexOf(tile), 2 * T);
       return {...at, image: framed.indexOf(tile), least: pairs.filter((_, i) => i % 2 === 0), greatest: pairs.filter((_, i) => i % 2)};
     }
-    const [shift, spread] = threes(affine, mapped.indexOf(tile), 2), image = order.indexOf(tile);
-    const scales = kind[tile] === 3 ? threes(decoded, dynamic.indexOf(tile)) : threes(still, of(2).indexOf(tile));
-    return {...at, image, shift, spread, scale: scales, network_four: starts[image]};
+    const image = dynamic.indexOf(tile), [shift, spread] = threes(affine, image, 2);
+    return {...at, image, shift, spread, scale: threes(decoded, image), network_four: image * networks[0].length / 4};
   });
   const values = VALUE_RANGES[encoding], {axis, tau} = timeAxis(times, period, profile);
-  const shape = {width, height, columns, mapped: mapped.length, dynamic: dynamic.length, framed: framed.length, values};
+  const shape = {width, height, columns, dynamic: dynamic.length, framed: framed.length, values};
   const lightmap = {
     times: Array.from(times), period, interpolation: profile.interpolation, time_axis: axis, tau, tiles: described, images,
     slices, record: recordFours(profile), tile_columns: columns, tile_size: TILE, hidden, gamma, height, textures,
@@ -173,7 +170,7 @@ function openLightmap(artifact, {templates, defaults}, bytes) {
   arrays.valid[size - 1] &= 255 << 8 * size - width * height;
   const changing = groups.map(({lightmap}) => lightmap.times).filter((list) => list.length > 1);
   const times = changing.length ? [...new Set(changing.flat())].sort((a, b) => a - b) : groups[0].lightmap.times;
-  const tiles = LIGHTMAP_KINDS.map((name, i) => [name, opened.reduce((sum, {kind}) => sum + kind.filter((each) => each === i).length, 0)]);
+  const tiles = Object.entries(LIGHTMAP_KINDS).map(([name, i]) => [name, opened.reduce((sum, {kind}) => sum + kind.filter((each) => each === i).length, 0)]);
   const figures = [
     ...compareSizes(bytes, sheets.reduce((sum, each, i) => sum + 6 * each.size[0] * each.size[1] * stamps(i).length, 0)),
     ['bits per texel and hour', (bytes * 8 / (width * height * times.length)).toFixed(3)],

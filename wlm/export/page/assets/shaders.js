@@ -17,12 +17,12 @@ const LIGHTMAP_UNITS = {
   outputs: (j) => `    y = wlm_lightmap_add(y, wlm_gelu(b[${j}]), third + ${4 * j}, 1);\n`,
 };
 
-// The shader of a sheet with the given settings and numbers of tiles: `mapped`, of which `dynamic`, and `framed`; `values`
-// are what the levels 0 and 1 stand for if the sheet is no light.
-function lightmapShader(templates, profile, {width, height, columns, mapped, dynamic, framed, values}) {
+// The shader of a sheet with the given settings and numbers of tiles, `dynamic` and `framed`; `values` are what the levels
+// 0 and 1 stand for if the sheet is no light.
+function lightmapShader(templates, profile, {width, height, columns, dynamic, framed, values}) {
   const side = profile.uvt_resolution, slices = profile.uvt_slices, {plane_columns, plane_rows} = profile;
   const across = {
-    uv: acrossOf(mapped, TILE, TILE), uvt: acrossOf(dynamic * slices, side, side),
+    uv: acrossOf(dynamic, TILE, TILE), uvt: acrossOf(dynamic * slices, side, side),
     planes: acrossOf(2 * dynamic, plane_rows, plane_columns), frames: acrossOf(framed, TILE, TILE),
   };
   const fours = Math.ceil(profile.hidden / 4), reach = 2, kind = values ? 'value' : 'radiance', [least, most] = values ?? [0, 1];
@@ -37,21 +37,20 @@ function lightmapShader(templates, profile, {width, height, columns, mapped, dyn
   };
   const part = (name, more = {}) => filled(templates[`${name}.glsl`], {...words, ...more});
   const maps = dynamic ? part('maps') : '';
-  const textures = {hour: true, networks: mapped, uv: mapped, uvt: dynamic, planes: dynamic, frames: framed, valid: true};
+  const textures = {hour: true, networks: dynamic, uv: dynamic, uvt: dynamic, planes: dynamic, frames: framed, valid: true};
   const held = Object.keys(textures).filter((name) => textures[name]);
   const reads = [['WLM_LIGHTMAP_HOUR_AT', 'wlm_lightmap_entry', 'hour'], ['WLM_LIGHTMAP_NET', 'wlm_lightmap_four', 'networks']];
   const entries = reads.filter(([, , name]) => held.includes(name)).map(([macro, function_, name]) =>
     part('entry', {macro, function: function_, texture: `WLM_LIGHTMAP_${name.toUpperCase()}`}));
   const samplers = held.map((name) => declared(`wlm_lightmap_${name}`, name === 'frames' ? 'sampler2DArray' : 'sampler2D'));
   let text = part('head', {use: '', textures: '', samplers: samplers.join(''), reads: entries.join('')}) + maps;
-  if (mapped) {
+  if (dynamic) {
     const units = Object.fromEntries(Object.entries(LIGHTMAP_UNITS).map(([name, line]) =>
       [name, Array.from({length: fours}, (_, j) => line(j)).join('')]));
-    const inputs = dynamic ? part('inputs') : '', sums = dynamic ? part('sums') : '';
-    text += part('network', {...units, gelu: templates[`gelu_${profile.gelu}.glsl`], inputs, sums});
+    text += part('network', {...units, gelu: templates[`gelu_${profile.gelu}.glsl`]});
   }
   text += (framed ? part('frames') : '') + part('unmapped', {frames: framed ? part('frames_kind') : ''});
-  text += part('colour', {kinds: mapped ? part('mapped_kind') : ''}) + part('source');
+  text += part('colour', {kinds: dynamic ? part('mapped_kind') : ''}) + part('source');
   return text + part(`linear_${kind}`) + part('last');
 }
 
