@@ -157,13 +157,13 @@ def _lightmap_step(device: str, tiles: int) -> tuple[Callable[[], object], Work]
     samples = float(profile.samples * tiles)
     # Adam reads and writes a parameter and its two moments, and reads its gradient, in float32.
     parameters = float(trainer.maps.numel() + trainer.hidden.numel() + trainer.output.numel())
-    # A sample adds to 8 endpoints and a weight of the first map, to as many at 8 corners of the second, and to 16
-    # numbers of planes.
+    # A sample adds to 8 endpoints and a weight of the first map; in two slices of the second one to 4 weights and to
+    # the endpoints of the blocks that its corners lie in, 25 / 16 on average; and to 16 numbers of planes.
     work = Work(
         bytes=28.0 * parameters,
         tensor=3.0 * operations * samples,
         special=activations * samples,
-        atomics=(9.0 + 8.0 * 9.0 + 16.0) * samples,
+        atomics=(9.0 + 2.0 * (4.0 + 8.0 * 25.0 / 16.0) + 16.0) * samples,
     )
     return lambda: trainer.run(_STEPS), work
 

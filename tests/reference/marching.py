@@ -103,13 +103,6 @@ def guide(scene: Scene, step: float, g: float, threshold: float) -> np.ndarray:
     return np.stack([light, t, depth])
 
 
-def nodes(scene: Scene, step: float) -> np.ndarray:
-    """Optical depths to the top and bottom at the lattice's nodes, [A, B, C, 2]."""
-    axes = [np.linspace(-0.5, n + 0.5, int(np.ceil((n + 1) / step)) + 1) for n in scene.density.shape]
-    p = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
-    return np.stack([depth_to(scene, p, way, step) for way in (scene.up, -scene.up)], -1)
-
-
 def lit(scene: Scene, toward: np.ndarray, step: float, g: float) -> np.ndarray:
     """Single scattering under one light, [H, W]."""
     o, d = scene.rays()

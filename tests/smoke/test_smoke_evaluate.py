@@ -11,10 +11,10 @@ from builders.smoke_samples import random_model, small_pool
 
 import wlm
 from wlm.metrics import psnr_from_mse
-from wlm.smoke.evaluation import coarse, evaluate, of_network, score
+from wlm.smoke.evaluation import evaluate, of_network, score
 from wlm.smoke.model import SmokeModel
 from wlm.smoke.network.dataset import make_validation
-from wlm.smoke.network.planes import GUIDES, OPACITY_PLANE, PLANES
+from wlm.smoke.network.planes import OPACITY_PLANE
 from wlm.smoke.network.settings import DatasetSettings
 
 FEW = DatasetSettings(
@@ -77,9 +77,3 @@ def test_the_test_set_is_held_out_from_the_choice_of_a_network(device):
         assert report.samples == 2 and abs(report.psnr - validation.psnr) > 0.1
         assert report.guide_psnr > 20 if kind == "six" else math.isnan(report.guide_psnr)
         assert {progress.stage for progress in reports} == {"dataset", "evaluate"}
-
-
-def test_the_coarse_march_is_its_guide():
-    pool = small_pool(2, kind="six")
-    for name, plane in zip(PLANES, coarse(pool, slice(0, 2)).unbind(2), strict=True):
-        assert torch.equal(plane, pool.guides[:, :, GUIDES["six"].index(name)].float())

@@ -11,6 +11,8 @@ from wlm_kernels.raster import mips as kernels
 
 # Steps per pixel beyond this read the last level; their squares stay finite.
 _MOST = 1e12
+# A GPU sums the gradients of textures with few numbers in 32 copies: additions to one number wait for one another.
+_COPIES, _FEW_NUMBERS = 32, 2**15
 
 
 def read(
@@ -66,7 +68,8 @@ class Read(torch.autograd.Function):
     @once_differentiable
     def backward(ctx, grad_out):
         stacks, uv, level = ctx.saved_tensors
-        on_stacks = zeros_for(stacks, ctx.needs_input_grad[0])
+        copies = _COPIES if stacks.is_cuda and len(uv) > stacks.numel() and stacks.numel() <= _FEW_NUMBERS else 1
+        on_stacks = zeros_for(stacks.expand(copies, *stacks.shape).movedim(0, -1), ctx.needs_input_grad[0])
         on_uv = torch.empty_like(uv) if ctx.needs_input_grad[3] else None
         on_level = torch.empty_like(level) if ctx.needs_input_grad[4] else None
         device = stacks.device
@@ -75,10 +78,10 @@ class Read(torch.autograd.Function):
                 to_warp(stacks),
                 to_warp(uv, wp.vec2),
                 to_warp(dense(grad_out)),
-                optional_array(on_stacks, 3, wp.float32, device),
+                optional_array(None if on_stacks is None else on_stacks.flatten(2), 3, wp.float32, device),
                 optional_array(on_uv, 1, wp.vec2, device),
                 optional_array(on_level, 1, wp.float32, device),
                 level=None if level is None else to_warp(level),
                 **ctx.mode,
             )
-        return on_stacks, None, None, on_uv, on_level, None, None
+        return None if on_stacks is None else on_stacks.sum(-1), None, None, on_uv, on_level, None, None

@@ -106,6 +106,7 @@ def _sample_backward(
     i = wp.tid()
     on_uv = wp.vec2()
     on_level = float(0.0)
+    copies = grad_texture.shape[2] // texture.shape[2]
     low, high, weight = _between(stacks, level, i)
     if not wp.isnan(weight):
         for side in range(wp.where(high > low, 2, 1)):
@@ -121,7 +122,7 @@ def _sample_backward(
                 g = grad_out[i, c]
                 if share != 0.0:
                     if grad_texture.shape[0] > 0:
-                        add(grad_texture, x, y, c, share * g)
+                        add(grad_texture, x, y, c * copies + i % copies, share * g)
                     if filter != NEAREST:
                         on_uv += share * g * read_slope(texture, x, y, c)
                 if moves:
@@ -183,7 +184,9 @@ def sample_backward(
     Args:
         texture, uv, size, levels, level, filter, boundary: Arguments of `sample`.
         grad_out: float [B N, C], gradient of the result.
-        grad_texture: float [B R, W, C], to which the gradient is added; of shape [0, 0, 0] if it is not wanted.
+        grad_texture: float [B R, W, C * K], to which the gradient is added; of shape [0, 0, 0] if it is not wanted. A
+            channel has K sums, which the caller adds up: sample i adds to number i % K. With K = 32 the threads of a
+            warp do not wait for one another where many samples read few texels.
         grad_uv: vec2 [B N], written; of shape [0] if it is not wanted.
         grad_level: float [B N], written; None or of shape [0] if it is not wanted.
     """

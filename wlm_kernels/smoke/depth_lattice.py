@@ -67,40 +67,53 @@ def _node(lattice: Lattice, i: int, j: int, k: int) -> wp.vec3:
     return lattice.origin + wp.transpose(lattice.axes) * at
 
 
+@wp.func
+def _on_line(pair: int, line: int, n: int, k: int) -> wp.vec4i:
+    """Returns the indices of the n-th node of a line along the first axis (pair 0) or along the second one."""
+    return wp.vec4i(pair, wp.where(pair == 0, n, line), wp.where(pair == 0, line, n), k)
+
+
 @wp.kernel(module="unique", module_options=OPTIONS)
 def _add_up(
     # in:
     gaps: wp.array4d[float],
     # out:
+    ahead: wp.array4d[float],
     nodes: wp.array4d[wp.vec2],
 ):
     """Sums optical depths from each node of a line to both of its ends; the light is beyond the last node."""
     pair, line, k = wp.tid()
-    first = pair == 0  # whether the line runs along the first axis
-    last = wp.where(first, nodes.shape[0], nodes.shape[1]) - 1
-    if line >= wp.where(first, nodes.shape[1], nodes.shape[0]):
+    last = wp.where(pair == 0, nodes.shape[1], nodes.shape[2]) - 1
+    if line >= wp.where(pair == 0, nodes.shape[2], nodes.shape[1]):
         return
-    ahead = float(0.0)
-    behind = float(0.0)
-    nodes[wp.where(first, last, line), wp.where(first, line, last), k, pair][0] = 0.0
-    nodes[wp.where(first, 0, line), wp.where(first, line, 0), k, pair][1] = 0.0
-    # Sums run from both ends over several nodes at a time, since loads wait for earlier stores.
+    # Several nodes at a time, since loads wait for earlier stores. Both depths of a node are stored at once, so that
+    # neighbouring threads write whole stretches of memory.
+    total = float(0.0)
     for begin in range(0, last, _AT_ONCE):
-        forth = _Several()
-        back = _Several()
+        several = _Several()
         for m in range(_AT_ONCE):
-            n = wp.min(begin + m, last - 1)
-            o = last - 1 - n
-            forth[m] = gaps[wp.where(first, n, line), wp.where(first, line, n), k, pair]
-            back[m] = gaps[wp.where(first, o, line), wp.where(first, line, o), k, pair]
+            q = _on_line(pair, line, wp.max(last - 1 - begin - m, 0), k)
+            several[m] = gaps[q[0], q[1], q[2], q[3]]
         for m in range(_AT_ONCE):
-            n = begin + m
-            if n < last:
-                behind += forth[m]
-                ahead += back[m]
-                o = last - 1 - n
-                nodes[wp.where(first, n + 1, line), wp.where(first, line, n + 1), k, pair][1] = behind
-                nodes[wp.where(first, o, line), wp.where(first, line, o), k, pair][0] = ahead
+            if begin + m < last:
+                total += several[m]
+                q = _on_line(pair, line, last - 1 - begin - m, k)
+                ahead[q[0], q[1], q[2], q[3]] = total
+    behind = float(0.0)
+    for begin in range(0, last, _AT_ONCE):
+        several = _Several()
+        to_end = _Several()
+        for m in range(_AT_ONCE):
+            q = _on_line(pair, line, wp.min(begin + m, last - 1), k)
+            several[m] = gaps[q[0], q[1], q[2], q[3]]
+            to_end[m] = ahead[q[0], q[1], q[2], q[3]]
+        for m in range(_AT_ONCE):
+            if begin + m < last:
+                q = _on_line(pair, line, begin + m, k)
+                nodes[q[0], q[1], q[2], q[3]] = wp.vec2(to_end[m], behind)
+                behind += several[m]
+    q = _on_line(pair, line, last, k)
+    nodes[q[0], q[1], q[2], q[3]] = wp.vec2(0.0, behind)
 
 
 @for_smoke
@@ -120,7 +133,7 @@ def _measure(smoke_type: Any, pairs: int) -> wp.Kernel:
         size = size_of(smoke.density)
         for pair in range(wp.static(pairs)):
             tau = float(0.0)
-            if wp.where(pair == 0, i, j) < wp.where(pair == 0, gaps.shape[0], gaps.shape[1]) - 1:
+            if wp.where(pair == 0, i, j) < wp.where(pair == 0, gaps.shape[1], gaps.shape[2]) - 1:
                 along = axis(lattice, pair)
                 d = lattice.gap[pair] / float(parts[pair])
                 for n in range(parts[pair]):
@@ -129,7 +142,7 @@ def _measure(smoke_type: Any, pairs: int) -> wp.Kernel:
                     low = wp.min(p) >= -0.5
                     if low and p[0] <= size[0] + 0.5 and p[1] <= size[1] + 0.5 and p[2] <= size[2] + 0.5:
                         tau += d * sample(smoke, p)
-            gaps[i, j, k, pair] = smoke.extinction * tau
+            gaps[pair, i, j, k] = smoke.extinction * tau
 
     return kernel
 
@@ -200,14 +213,15 @@ def add_up(medium: Medium, lattice: Lattice, counts: Sequence[int], pairs: int, 
     """Computes the optical depths from the nodes of a lattice of `make_lattice` to one or two `pairs` of opposite
     lights at infinity: at both ends of the lattice's first axis, and of its second.
 
-    `light_step` is the longest step between two nodes, in voxels. Returns vec2 [X, Y, Z, pairs] for each node: depths
+    `light_step` is the longest step between two nodes, in voxels. Returns vec2 [pairs, X, Y, Z] for each node: depths
     to the light at the axis's end and to the light at its start.
     """
     parts = wp.vec2i(*(parts_of(lattice.gap[n], light_step) for n in range(2)))
-    gaps, nodes = medium.buffer((*counts, pairs), float), medium.buffer((*counts, pairs), wp.vec2)
+    gaps, ahead = (medium.buffer((pairs, *counts), float) for _ in range(2))
+    nodes = medium.buffer((pairs, *counts), wp.vec2)
     _measure(medium, tuple(counts), [lattice, parts], [gaps], pairs)
     lines = max(counts[:2]) if pairs == 2 else counts[1]
-    wp.launch(_add_up, (pairs, lines, counts[2]), [gaps], [nodes], device=medium.device)
+    wp.launch(_add_up, (pairs, lines, counts[2]), [gaps], [ahead, nodes], device=medium.device)
     return nodes
 
 

@@ -197,6 +197,18 @@ def ray(view: View, row: int, column: int) -> Ray:
     return r
 
 
+def in_tiles(height: int, width: int) -> tuple[int, int, int]:
+    """Returns the size of a launch in which the 32 threads of a warp have the pixels of 4 rows and 8 columns: their
+    rays read neighbouring voxels. See `pixel_of`."""
+    return -(-height // 4), -(-width // 8), 32
+
+
+@wp.func
+def pixel_of(a: int, b: int, lane: int) -> wp.vec2i:
+    """Returns the row and the column of a thread of an `in_tiles` launch, which may lie outside the image."""
+    return wp.vec2i(4 * a + lane // 8, 8 * b + lane % 8)
+
+
 @wp.func
 def clip(size: wp.vec3, origin: wp.vec3, direction: wp.vec3) -> wp.vec2:
     """Finds the first and last distance along a ray at which smoke may be; first > last if the ray misses the grid."""

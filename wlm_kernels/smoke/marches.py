@@ -6,12 +6,12 @@ first: `guide` is algorithm 1 of neural-six-way-lightmaps in 20 lines, and `lit`
 `tests/smoke/test_motion.py` computes `motion` pixel by pixel.
 """
 
-from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import warp as wp
 
-from wlm_kernels.smoke.depth_lattice import Lattice, add_up, axis, depths_at, make_lattice, spacing_of
+from wlm_kernels.smoke.depth_lattice import Lattice, add_up, axis, depths_at, make_lattice, reach, spacing_of
 from wlm_kernels.smoke.march import (
     BRICK,
     OPTIONS,
@@ -24,13 +24,13 @@ from wlm_kernels.smoke.march import (
     between_nodes,
     emitted,
     for_smoke,
+    in_tiles,
     look,
-    node_position,
-    nodes_along,
     optical_depth,
     parameters,
     pass_step,
     phase,
+    pixel_of,
     require_orthographic,
     size_of,
     surface,
@@ -55,23 +55,6 @@ def _both_depths(smoke: Any, p: wp.vec3, up: wp.vec3, step: float) -> wp.vec2:
 
 
 @for_smoke
-def _guide_nodes(smoke_type: Any) -> wp.Kernel:
-    @wp.kernel(module="unique", module_options=OPTIONS)
-    def kernel(
-        # in:
-        smoke: smoke_type,
-        up: wp.vec3,
-        step: float,
-        # out:
-        nodes: wp.array3d[wp.vec2],
-    ):
-        a, b, c = wp.tid()
-        nodes[a, b, c] = _both_depths(smoke, node_position(nodes, size_of(smoke.density), a, b, c), up, step)
-
-    return kernel
-
-
-@for_smoke
 def _guide(smoke_type: Any, from_lattice: bool) -> wp.Kernel:
     @wp.kernel(module="unique", module_options=OPTIONS)
     def kernel(
@@ -79,14 +62,19 @@ def _guide(smoke_type: Any, from_lattice: bool) -> wp.Kernel:
         smoke: smoke_type,
         nodes: wp.array3d[wp.vec2],
         view: View,
+        lattice: Lattice,
         march: MarchParameters,
         # out:
         out: wp.array3d[float],
     ):
-        row, column = wp.tid()
+        a, b, lane = wp.tid()
+        pixel = pixel_of(a, b, lane)
+        row = pixel[0]
+        column = pixel[1]
+        if row >= view.height or column >= view.width:
+            return
         random = wp.rand_init(march.seed, row * view.width + column)
         r = begin(view, row, column, smoke, march.step, 0.5 + march.jitter * (wp.randf(random) - 0.5))
-        size = size_of(smoke.density)
         light = float(0.0)
         depth = float(0.0)
         rise = wp.dot(view.up, r.direction)
@@ -99,9 +87,7 @@ def _guide(smoke_type: Any, from_lattice: bool) -> wp.Kernel:
                 depth = surface(depth, r, view, march.threshold)
                 tau = wp.vec2()
                 if wp.static(from_lattice):
-                    last = wp.vec3(float(nodes.shape[0] - 1), float(nodes.shape[1] - 1), float(nodes.shape[2] - 1))
-                    one = wp.vec3(1.0, 1.0, 1.0)
-                    tau = between_nodes(nodes, wp.cw_div(wp.cw_mul(r.place + 0.5 * one, last), size + one))
+                    tau = depths_at(nodes, lattice, r.place)
                 else:
                     tau = _both_depths(smoke, r.place, view.up, march.step)
                 # The light from the front comes along the ray, through the smoke that the ray has passed.
@@ -113,18 +99,6 @@ def _guide(smoke_type: Any, from_lattice: bool) -> wp.Kernel:
         out[2, row, column] = depth
 
     return kernel
-
-
-def guide_nodes(medium: Medium, up: Sequence[float], step: float) -> wp.array:
-    """Computes optical depths towards the top, a direction of length 1, and the bottom at the nodes of a lattice over
-    the grid's box: vec2 [A, B, C], see `march.node_position`.
-
-    `step` is the largest distance between nodes (at least a voxel is used) and longest step of a march from a node, in
-    voxels.
-    """
-    nodes = medium.buffer(nodes_along(medium.density.shape, step), wp.vec2)
-    _guide_nodes(medium, nodes.shape, [wp.vec3(*map(float, up)), step], [nodes])
-    return nodes
 
 
 def guide(medium: Medium, view: View, march: March, out: wp.array, *, shared: bool = True) -> None:
@@ -143,19 +117,23 @@ def guide(medium: Medium, view: View, march: March, out: wp.array, *, shared: bo
         out: float [3, H, W], written: sum of the light scattered under the three lights, each of irradiance 4 pi;
             transparency; distance from the camera, in the unit of `View.voxel`, to the first sample denser than the
             threshold, 0 if there is none.
-        shared: Whether the optical depths to the top and the bottom are interpolated from `guide_nodes`; otherwise each
-            sample marches to the lights itself, which is slower and more exact.
+        shared: Whether the optical depths to the top and the bottom are interpolated between the nodes of a lattice,
+            at least a voxel apart; otherwise each sample marches to the lights itself, which is slower and more exact.
     """
-    nodes = guide_nodes(medium, view.up, march.step) if shared else medium.buffer((0, 0, 0), wp.vec2)
-    _guide(medium, out.shape[1:], [nodes, view, parameters(march)], [out], shared)
+    lattice, nodes = Lattice(), medium.buffer((0, 0, 0), wp.vec2)
+    if shared:
+        lattice, nodes = reach(
+            medium, view.up, None, replace(march, spacing=max(march.step, 1.0), light_step=march.step)
+        )
+    _guide(medium, in_tiles(*out.shape[1:]), [nodes, view, lattice, parameters(march)], [out], shared)
 
 
 @wp.func
 def _in_plane(nodes: wp.array4d[wp.vec2], i: int, j: int, k: int, fx: float, fy: float) -> wp.vec4:
     sides = wp.vec4()
     for pair in range(2):
-        a = wp.lerp(nodes[i, j, k, pair], nodes[i, j + 1, k, pair], fy)
-        b = wp.lerp(nodes[i + 1, j, k, pair], nodes[i + 1, j + 1, k, pair], fy)
+        a = wp.lerp(nodes[pair, i, j, k], nodes[pair, i, j + 1, k], fy)
+        b = wp.lerp(nodes[pair, i + 1, j, k], nodes[pair, i + 1, j + 1, k], fy)
         c = wp.lerp(a, b, fx)
         sides[2 * pair] = c[0]
         sides[2 * pair + 1] = c[1]
@@ -175,7 +153,12 @@ def _coarse(smoke_type: Any, hot: bool) -> wp.Kernel:
         # out:
         out: wp.array3d[float],
     ):
-        row, column = wp.tid()
+        a, b, lane = wp.tid()
+        pixel = pixel_of(a, b, lane)
+        row = pixel[0]
+        column = pixel[1]
+        if row >= view.height or column >= view.width:
+            return
         r = begin_jittered(view, row, column, smoke, march)
         sides = wp.vec4()
         glow = float(0.0)
@@ -183,8 +166,8 @@ def _coarse(smoke_type: Any, hot: bool) -> wp.Kernel:
         # All samples of the ray share its place in the lattice's first two axes.
         x = (wp.dot(r.origin - view.origin, view.right) - lattice.low[0]) / lattice.gap[0]
         y = (wp.dot(r.origin - view.origin, view.up) - lattice.low[1]) / lattice.gap[1]
-        i = wp.clamp(int(x), 0, nodes.shape[0] - 2)
-        j = wp.clamp(int(y), 0, nodes.shape[1] - 2)
+        i = wp.clamp(int(x), 0, nodes.shape[1] - 2)
+        j = wp.clamp(int(y), 0, nodes.shape[2] - 2)
         fx = wp.clamp(x - float(i), 0.0, 1.0)
         fy = wp.clamp(y - float(j), 0.0, 1.0)
         loaded = int(-1)  # the plane of nodes whose depths are in `near`
@@ -197,7 +180,7 @@ def _coarse(smoke_type: Any, hot: bool) -> wp.Kernel:
             if r.x > 0.0:
                 depth = surface(depth, r, view, march.threshold)
                 z = (r.distance - lattice.low[2]) / lattice.gap[2]
-                k = wp.clamp(int(z), 0, nodes.shape[2] - 2)
+                k = wp.clamp(int(z), 0, nodes.shape[3] - 2)
                 if k != loaded:
                     near = _in_plane(nodes, i, j, k, fx, fy)
                     far = _in_plane(nodes, i, j, k + 1, fx, fy)
@@ -244,7 +227,7 @@ def coarse_six_way(medium: Medium, view: View, march: March, out: wp.array) -> N
     lattice, counts = make_lattice(medium.density.shape, (view.right, view.up, view.forward), spacing, view.origin)
     nodes = add_up(medium, lattice, counts, 2, light_step)
     hot = medium.temperature is not None
-    _coarse(medium, out.shape[1:], [nodes, view, lattice, parameters(march)], [out], hot)
+    _coarse(medium, in_tiles(*out.shape[1:]), [nodes, view, lattice, parameters(march)], [out], hot)
 
 
 @for_smoke
@@ -261,7 +244,12 @@ def _light(smoke_type: Any) -> wp.Kernel:
         # out:
         out: wp.array3d[float],
     ):
-        row, column = wp.tid()
+        a, b, lane = wp.tid()
+        pixel = pixel_of(a, b, lane)
+        row = pixel[0]
+        column = pixel[1]
+        if row >= view.height or column >= view.width:
+            return
         r = begin_jittered(view, row, column, smoke, march)
         light = wp.vec2()
         cosine = wp.dot(axis(lattice, 0), r.direction)
@@ -299,7 +287,12 @@ def _unlit(smoke_type: Any) -> wp.Kernel:
         # out:
         out: wp.array3d[float],
     ):
-        row, column = wp.tid()
+        a, b, lane = wp.tid()
+        pixel = pixel_of(a, b, lane)
+        row = pixel[0]
+        column = pixel[1]
+        if row >= view.height or column >= view.width:
+            return
         r = begin_jittered(view, row, column, smoke, march)
         glow = float(0.0)
         depth = float(0.0)
@@ -331,12 +324,12 @@ def light(
             irradiance 4 pi. For a point light [1, H, W]: its irradiance is 4 pi at a distance of one voxel.
     """
     lattice, nodes = depths
-    _light(medium, out.shape[1:], [nodes, view, lattice, parameters(march), shadow], [out])
+    _light(medium, in_tiles(*out.shape[1:]), [nodes, view, lattice, parameters(march), shadow], [out])
 
 
 def unlit(medium: Medium, view: View, march: March, out: wp.array) -> None:
     """Renders unlit smoke: writes the images `UNLIT_PLANES` to `out`, float [3, H, W]; arguments as for `light`."""
-    _unlit(medium, out.shape[1:], [view, parameters(march)], [out])
+    _unlit(medium, in_tiles(*out.shape[1:]), [view, parameters(march)], [out])
 
 
 @for_smoke
@@ -352,7 +345,12 @@ def _motion(smoke_type: Any) -> wp.Kernel:
         # out:
         out: wp.array3d[float],
     ):
-        row, column = wp.tid()
+        a, b, lane = wp.tid()
+        pixel = pixel_of(a, b, lane)
+        row = pixel[0]
+        column = pixel[1]
+        if row >= view.height or column >= view.width:
+            return
         r = begin(view, row, column, smoke, march.step, 0.5)
         size = size_of(smoke.density)
         cells = wp.vec3(float(velocity.shape[0]), float(velocity.shape[1]), float(velocity.shape[2]))
@@ -402,4 +400,4 @@ def motion(medium: Medium, view: View, velocity: wp.array, reach: float, march: 
         out: float [2, H, W], written: pixels to the right and down; 0 where there is no smoke.
     """
     require_orthographic(view, "motion vectors")
-    _motion(medium.in_bricks(), out.shape[1:], [velocity, reach, view, parameters(march)], [out])
+    _motion(medium.in_bricks(), in_tiles(*out.shape[1:]), [velocity, reach, view, parameters(march)], [out])

@@ -35,15 +35,6 @@ def test_a_day_comes_back():
     assert "6 bits of latents a texel, 300 steps on cpu" in long.option
 
 
-@pytest.mark.parametrize("shape", [(1, 1, 1), (2, 1, 1), (3, 5, 3), (2, 3, 131)])
-def test_sizes(shape):
-    frames = moving_light(*shape[1:], hours=tuple(range(shape[0]))).light.frames
-    rival = encode(frames, steps=80)
-    assert rival.decoded.shape == frames.shape
-    assert psnr(frames, rival.decoded) > 12.0
-    assert rival.bytes == bytes_of(*shape[1:], shape[0]) + 12 * (shape[2] > 128)
-
-
 def test_what_lies_in_the_gaps_changes_nothing():
     frames, mask = moving_light(24, 40).light.frames, np.ones((24, 40), bool)
     mask[7:20, 10:35] = False

@@ -32,15 +32,6 @@ def test_a_day_comes_back(name):
     assert rival.encode_seconds > 0.0 and rival.decode_seconds > 0.0
 
 
-@pytest.mark.parametrize("name", KINDS)
-@pytest.mark.parametrize("shape", [(1, 1, 1), (2, 1, 1), (1, 5, 3), (3, 5, 3), (2, 3, 131)])
-def test_sizes(name, shape):
-    frames = day(*shape[1:], hours=shape[0])
-    decoded = RIVALS[name].encode(frames, np.ones(shape[1:], bool)).decoded
-    assert decoded.shape == frames.shape
-    np.testing.assert_allclose(decoded, frames, atol=0.05 * frames.max())
-
-
 def test_one_light_in_three_strengths_is_one_component():
     light = smooth_light(64, 64)
     frames = np.stack([light, 0.5 * light, 0.1 * light])

@@ -82,7 +82,7 @@ def bake_coarse(volume: DensityVolume, camera: Camera, march: March = March()) -
         volume: The smoke.
         camera: Orthographic.
         march: Settings. Nodes of the lattice that stores optical depths to the lights are at least a quarter of a voxel
-            apart, and farther apart if there would be more than 2^28 nodes; a node takes 24 bytes. There are 64
+            apart, and farther apart if there would be more than 2^28 nodes; a node takes 32 bytes. There are 64
             different seeds of the jitter, which is gradient noise.
 
     Returns:
@@ -155,4 +155,4 @@ def guide(volume: DensityVolume, camera: Camera, march: March = March(), *, shar
 def with_surface(six: SixWay, volume: DensityVolume, looks: Looks | None) -> SixWay:
     """Returns lightmaps with the depth of the smoke's surface if `looks` has obstacles, else without a depth."""
     obstacles = looks is not None and looks.obstacles
-    return replace(six, depth=guide(volume, six.camera, _SURFACE).depth if obstacles else None)
+    return replace(six, depth=run(marches.unlit, volume, six.camera, (3,), _SURFACE)[2] if obstacles else None)
