@@ -27,6 +27,7 @@ from wlm.atlas.decode import Decoder as AtlasDecoder
 from wlm.atlas.fit import compress as compress_atlas
 from wlm.atlas.model import Profile as AtlasProfile
 from wlm.fluid.lattice import Lattice
+from wlm.fluid.solver import ways_of
 from wlm.fluid.volume import DensityVolume
 from wlm.lightmap.data import from_arrays
 from wlm.lightmap.model import LightmapModel, Sheet
@@ -272,11 +273,13 @@ def _advection(scheme: str) -> Callable[[str, int], tuple[Callable[[], object], 
         fields = [advection.Fields(interop.to_warp(smoke.clone()), nothing) for _ in range(3)]
         velocity = wp.array(np.random.default_rng(0).normal(0, 0.05, (n**3, 3)), dtype=wp.vec3, device=device)
         walls = wp.zeros(0, dtype=wp.uint8, device=device)
+        traces = wp.empty(ways_of(scheme) * n**3, dtype=wp.vec3, device=device)
 
         def step() -> None:
-            advection.advect(box, velocity, walls, fields[0], fields[1], 2)
+            advection_places.trace(box, velocity, 2, traces)
+            advection.advect(box, traces, walls, fields[0], fields[1])
             if scheme == "maccormack":
-                advection.advect(box, velocity, walls, fields[0], fields[2], 2, predicted=fields[1])
+                advection.advect(box, traces, walls, fields[0], fields[2], predicted=fields[1])
 
         passes = 2 if scheme == "maccormack" else 1
         # Smoke once in and once out; two passes read the prediction, too. 8 corners of smoke and of three velocities.

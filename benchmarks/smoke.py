@@ -372,13 +372,19 @@ def _swirl(n: int, device: str) -> wp.array:
     return wp.array(u.reshape(-1, 3).astype(np.float32), dtype=wp.vec3, device=device)
 
 
+def _traces(velocity: wp.array) -> wp.array:
+    return wp.empty(2 * velocity.size, dtype=wp.vec3, device=velocity.device)
+
+
 def _carry(bench: SmokeBench, scheme: str, box, velocity, walls, fields) -> Callable[[], None]:
     """Returns a call that does one advection step into a second field, so that each replay does the same work."""
+    traces = _traces(velocity)
 
     def step() -> None:
-        advection.advect(box, velocity, walls, fields[0], fields[1], _SUBSTEPS)
+        advection_places.trace(box, velocity, _SUBSTEPS, traces)
+        advection.advect(box, traces, walls, fields[0], fields[1])
         if scheme == "maccormack":
-            advection.advect(box, velocity, walls, fields[0], fields[2], _SUBSTEPS, predicted=fields[1])
+            advection.advect(box, traces, walls, fields[0], fields[2], predicted=fields[1])
 
     return bench.replay(step)
 
@@ -404,15 +410,16 @@ def _carry_bricks(bench, scheme: str, fill: float, box, velocity, walls):
     # A graph has no pool that grows.
     pool.reserve(pool.most)
     pool.put(*gather([_cube(bench, fill)]))
-    busy, bricks, fields = wp.clone(pool.bricks.busy), pool.bricks, pool.fields
+    busy, bricks, fields, traces = wp.clone(pool.bricks.busy), pool.bricks, pool.fields, _traces(velocity)
 
     def step() -> None:
         wp.copy(bricks.busy, busy)
         pool.relist()
         pool.store()
-        advection.advect(box, velocity, walls, fields[0], fields[1], _SUBSTEPS, bricks=bricks)
+        advection_places.trace(box, velocity, _SUBSTEPS, traces)
+        advection.advect(box, traces, walls, fields[0], fields[1], bricks=bricks)
         if scheme == "maccormack":
-            advection.advect(box, velocity, walls, fields[0], fields[2], _SUBSTEPS, bricks=bricks, predicted=fields[1])
+            advection.advect(box, traces, walls, fields[0], fields[2], bricks=bricks, predicted=fields[1])
 
     return bench.replay(step), pool
 
@@ -436,12 +443,13 @@ def _turn(bench: SmokeBench, scheme: str, storage: str) -> dict[str, float]:
     distance = (x * x + y * y + z * z).sqrt() / radius
     ball = torch.where(distance < 1.0, 0.5 + 0.5 * torch.cos(math.pi * distance), 0.0)
     fields = [_fields(ball, storage, device) for _ in range(3)]
-    nothing = wp.empty(0, dtype=wp.uint8, device=device)
+    nothing, traces = wp.empty(0, dtype=wp.uint8, device=device), _traces(velocity)
     with stream(device):
+        advection_places.trace(box, velocity, 1.0, traces)
         for _ in range(steps):
-            advection.advect(box, velocity, nothing, fields[0], fields[1], 1.0)
+            advection.advect(box, traces, nothing, fields[0], fields[1])
             if scheme == "maccormack":
-                advection.advect(box, velocity, nothing, fields[0], fields[2], 1.0, predicted=fields[1])
+                advection.advect(box, traces, nothing, fields[0], fields[2], predicted=fields[1])
                 fields[1], fields[2] = fields[2], fields[1]
             fields[0], fields[1] = fields[1], fields[0]
         error = (wp.to_torch(fields[0].density).reshape(ball.shape).float() - ball).double()

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from wlm.fluid.obstacles import surface
 from wlm_kernels.fluid import advection_sources
-from wlm_kernels.fluid.advection import STORAGES, Fields, advect
+from wlm_kernels.fluid.advection import STORAGES, Fields, advect, mark_smoke
 from wlm_kernels.fluid.advection_adjoint import source_backward
 from wlm_kernels.fluid.advection_places import (
     BRICK,
@@ -16,11 +16,13 @@ from wlm_kernels.fluid.advection_places import (
     DENSE,
     OPEN,
     PERIODIC,
+    choose,
     make_box,
     make_bricks,
     mark_walls,
     relist,
     rings_for,
+    trace,
 )
 
 WRAPPED = ((PERIODIC, PERIODIC),) * 3
@@ -54,8 +56,9 @@ class Grid:
         scheme: str = "maccormack",
         reach: float | None = None,
         threshold: float = 0.0,
+        pool: bool = True,
     ):
-        """`reach`: fine cells that a trace goes in a step, with bricks; None: without bricks."""
+        """`reach`: fine cells that a trace goes in a step, with bricks, in a pool or not; None: without bricks."""
         coarse = u.shape[:3]
         self.box, self.device, self.scheme = make_box(coarse, refinement, ends), device, scheme
         self.dtype = STORAGES[storage]
@@ -70,6 +73,8 @@ class Grid:
             total = self.bricks.busy.size
             self.bricks.free = wp.array(np.arange(1, total + 1), dtype=int, device=device)
             self.bricks.depth.fill_(total)
+            if not pool:
+                self.bricks.workers = 0
 
     def fields(self, density: np.ndarray, temperature: np.ndarray | None = None) -> Fields:
         values = np.zeros(0) if temperature is None else temperature
@@ -95,28 +100,34 @@ class Grid:
 
     def run(self, fields: Fields, dt: float, steps: int = 1, decay=(1.0, 1.0)) -> Fields:
         spare = [Fields(wp.zeros_like(fields.density), wp.zeros_like(fields.temperature)) for _ in range(2)]
-        at = [self.box, self.u, self.walls]
+        traces = wp.full(2 * self.u.size, np.nan, dtype=wp.vec3, device=self.device)
+        at = [self.box, traces, self.walls]
         for _ in range(steps):
-            if self.bricks is not DENSE:
+            if self.bricks.workers > 0:
                 relist(self.box, self.bricks)
-                self.computed += int(self.bricks.counts.numpy()[0]) * BRICK**3
                 advection_sources.store(self.bricks, fields)
+            elif self.bricks is not DENSE:
+                mark_smoke(self.box, fields, self.bricks)
+                choose(self.box, self.bricks)
+            if self.bricks is not DENSE:
+                self.computed += np.count_nonzero(self.bricks.places.numpy()) * BRICK**3
+            trace(self.box, self.u, dt, traces, self.bricks)
             if self.scheme == "maccormack":
-                advect(*at, fields, spare[0], dt, bricks=self.bricks)
-                advect(*at, fields, spare[1], dt, decay, self.bricks, spare[0])
+                advect(*at, fields, spare[0], bricks=self.bricks)
+                advect(*at, fields, spare[1], decay, self.bricks, spare[0])
                 fields, spare[1] = spare[1], fields
             else:
-                advect(*at, fields, spare[0], dt, decay, self.bricks)
+                advect(*at, fields, spare[0], decay, self.bricks)
                 fields, spare[0] = spare[0], fields
         return fields
 
     def array(self, flat: wp.array) -> np.ndarray:
-        values = flat.numpy() if self.bricks is DENSE else flat.numpy()[self.indices]
+        values = flat.numpy() if self.bricks.workers == 0 else flat.numpy()[self.indices]
         return values.reshape(self.shape).astype(np.float64)
 
     def carried(self, density: np.ndarray, dt: float, steps: int = 1) -> np.ndarray:
         """A density after some steps."""
-        fields = self.fields(density) if self.bricks is DENSE else self.pooled(density)
+        fields = self.fields(density) if self.bricks.workers == 0 else self.pooled(density)
         return self.array(self.run(fields, dt, steps).density)
 
 
@@ -358,16 +369,17 @@ def test_buoyancy_is_of_means(refinement: int, device: str):
 @pytest.mark.parametrize("ends", [WRAPPED, SHUT])
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_bricks_give_the_dense_result(scheme: str, ends, device: str):
-    """A puff that crosses the domain's end, and its cut bricks: within 1e-5 at a threshold of 1e-6; with 0 exactly."""
+    """A puff that crosses the domain's end, and its cut bricks: within 1e-5 at a threshold of 1e-6; with 0 exactly, in
+    a pool and not."""
     u = np.random.default_rng(6).uniform(-0.2, 0.2, (25, 3, 4, 3)) + (0.6, 0.0, -0.4)
     dense = Grid(u, 3, ends, device, scheme=scheme)
     start = 1.0 * (_blob(dense.shape, 3, (22.0, 1.5, 2.0), 0.5) > 0.1)
     expected = dense.carried(start, 1.0, 12)
-    for threshold, most in ((0.0, 0.0), (1e-6, 1e-5)):
-        sparse = Grid(u, 3, ends, device, scheme=scheme, reach=3.0 * 1.1, threshold=threshold)
+    for threshold, most, pool in ((0.0, 0.0, True), (1e-6, 1e-5, True), (0.0, 0.0, False)):
+        sparse = Grid(u, 3, ends, device, scheme=scheme, reach=3.0 * 1.1, threshold=threshold, pool=pool)
         got = sparse.carried(start, 1.0, 12)
         np.testing.assert_allclose(got, expected, rtol=0, atol=most)
-    assert sparse.computed < 0.8 * 12 * sparse.bricks.busy.size * BRICK**3
+        assert sparse.computed < 0.8 * 12 * sparse.bricks.busy.size * BRICK**3
 
 
 def test_smoke_jumps_over_a_brick_that_is_cut_short(device: str):

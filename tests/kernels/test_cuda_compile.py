@@ -102,7 +102,7 @@ def _boundaries(kind: tuple[str, str], balance: bool) -> list:
 
 def _advection(bricks: bool, solids: bool, stored: type) -> list:
     carry = [advection.carry_kernel(correcting, stored, bricks, solids, not solids) for correcting in BOTH]
-    return _members(carry, list(advection_sources.source_kernels(stored).values()))
+    return _members(carry, [advection.mark_kernel(stored)], list(advection_sources.source_kernels(stored).values()))
 
 
 def _planes(half: bool) -> list:

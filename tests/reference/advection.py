@@ -32,6 +32,10 @@ class Domain:
         return {}
 
     @cached_property
+    def ways(self) -> dict:
+        return {}
+
+    @cached_property
     def shape(self) -> np.ndarray:
         return np.array(self.solid.shape) * self.refinement
 
@@ -39,9 +43,9 @@ class Domain:
     def fine_solid(self) -> np.ndarray:
         return np.kron(self.solid, np.ones((self.refinement,) * 3, bool))
 
-    def corners(self, p: np.ndarray, shape: np.ndarray, about: np.ndarray | None = None):
-        """The eight cells around p (or around `about`), among cells of size 1, with their trilinear weights for p."""
-        base = np.floor((p if about is None else about) - 0.5)
+    def corners(self, p: np.ndarray, shape: np.ndarray):
+        """The eight cells around p, among cells of size 1, with their trilinear weights."""
+        base = np.floor(p - 0.5)
         f = p - 0.5 - base
         for corner in itertools.product((0, 1), repeat=3):
             cell = (base + corner).astype(int)
@@ -78,22 +82,23 @@ class Domain:
         cell = (self.into_domain(p) / self.refinement).astype(int)
         return bool(cells[tuple(np.minimum(cell, np.array(cells.shape) - 1))])
 
+    def way(self, cell: tuple[int, ...], dt: float) -> np.ndarray:
+        """-dt u(x - dt u(x) / 2) for the centre x of a coarse cell, in fine cells; each is computed once."""
+        if (cell, dt) not in self.ways:
+            middle = self.refinement * (np.array(cell) + 0.5 - 0.5 * dt * self.u[cell])
+            self.ways[cell, dt] = -dt * self.velocity(middle)
+        return self.ways[cell, dt]
+
     def departure_point(self, x: np.ndarray, dt: float) -> np.ndarray:
-        """x - dt u(x - dt u(x) / 2), cut where the trace meets a solid; each is computed once."""
+        """x and the way between those of the coarse cells, cut where it meets a solid; each is computed once."""
         key = *x, dt
         if key not in self.ends_of_traces:
             self.ends_of_traces[key] = self._trace(x, dt)
         return self.ends_of_traces[key]
 
     def _trace(self, x: np.ndarray, dt: float) -> np.ndarray:
-        middle = x - 0.5 * dt * self.velocity(x)
-        away = middle / self.refinement - 0.5 - np.floor(x / self.refinement - 0.5)
-        v = self.velocity(middle)
-        if (np.abs(away - 0.5) <= 0.75).all():
-            # Extrapolated from the velocities around the start.
-            around = self.corners(middle / self.refinement, np.array(self.solid.shape), x / self.refinement)
-            v = self.refinement * sum(w * self.u[c] for c, w in around)
-        end = x - dt * v
+        around = self.corners(x / self.refinement, np.array(self.solid.shape))
+        end = x + sum(w * self.way(c, dt) for c, w in around)
         if self.at(self.solid, end):
             free = x
             for _ in range(6):

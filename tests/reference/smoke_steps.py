@@ -106,8 +106,8 @@ class Smoke:
         self.near = np.lib.stride_tricks.sliding_window_view(near, (3, 3, 3)).any((3, 4, 5))
         self.x = np.stack(np.meshgrid(*(np.arange(k) + 0.5 for k in self.n), indexing="ij"), -1).reshape(-1, 3)
 
-    def _corners(self, p: np.ndarray, n: np.ndarray, about: np.ndarray):
-        base = np.floor(about - 0.5)
+    def _corners(self, p: np.ndarray, n: np.ndarray):
+        base = np.floor(p - 0.5)
         f = p - 0.5 - base
         for corner in itertools.product((0, 1), repeat=3):
             cell = (base + corner).astype(int)
@@ -128,18 +128,13 @@ class Smoke:
         at = np.minimum((self._into(p) / self.refinement).astype(int), self.coarse - 1)
         return cells[tuple(at.T)]
 
-    def _velocity(self, u: np.ndarray, p: np.ndarray, about: np.ndarray) -> np.ndarray:
-        r = self.refinement
-        return r * sum(w[:, None] * u[c] for c, w in self._corners(p / r, self.coarse, about / r))
-
     def _trace(self, u: np.ndarray, dt: float) -> np.ndarray:
         x, r = self.x, self.refinement
-        middle = x - 0.5 * dt * self._velocity(u, x, x)
-        away = middle / r - 0.5 - np.floor(x / r - 0.5)
-        within = self._into(middle)
-        extrapolated = (np.abs(away - 0.5) <= 0.75).all(1)[:, None]
-        v = np.where(extrapolated, self._velocity(u, middle, x), self._velocity(u, within, within))
-        end = x - dt * v
+        centres = np.stack(np.meshgrid(*(np.arange(k) + 0.5 for k in self.coarse), indexing="ij"), -1).reshape(-1, 3)
+        middle = self._into(r * (centres - 0.5 * dt * u.reshape(-1, 3))) / r
+        way = -dt * r * sum(w[:, None] * u[c] for c, w in self._corners(middle, self.coarse))
+        way = way.reshape(u.shape)
+        end = x + sum(w[:, None] * way[c] for c, w in self._corners(x / r, self.coarse))
         cut = self._at(self.solid, end)
         free, solid = x.copy(), end.copy()
         for _ in range(6):
@@ -155,7 +150,7 @@ class Smoke:
     def _read(self, values: np.ndarray, p: np.ndarray) -> np.ndarray:
         total = weight = 0.0
         within = self._into(p)
-        for cell, w in self._corners(within, self.n, within):
+        for cell, w in self._corners(within, self.n):
             w = np.where(self.fine_solid[cell], 0.0, w)
             total, weight = total + w * values[cell], weight + w
         return total / np.maximum(weight, 1e-6)
@@ -170,7 +165,7 @@ class Smoke:
             out = predicted
             if self.scheme == "maccormack":
                 back = self._read(predicted.reshape(self.n), q)
-                around = np.stack([values[c] for c, _ in self._corners(inside, self.n, inside)])
+                around = np.stack([values[c] for c, _ in self._corners(inside, self.n)])
                 raw = predicted + 0.5 * (values.ravel() - back)
                 out = np.where(plain, predicted, np.clip(raw, around.min(0), around.max(0)))
             results.append(decay * out.reshape(self.n))

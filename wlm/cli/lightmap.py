@@ -37,7 +37,7 @@ _SHOWN = (
     ("texels beside charts, dB", "ring", ".2f", 1.0),
     ("between stored times, dB", "between", ".2f", 1.0),
     ("error at tile borders relative to inside", "border", ".2f", 1.0),
-    ("flicker, %", "flicker", ".3f", 100.0),
+    ("flicker, % of the range", "flicker", ".3f", 100.0),
     ("views, dB", "view_psnr", ".2f", 1.0),
     ("views, FLIP", "view_flip", ".4f", 1.0),
 )

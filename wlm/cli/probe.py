@@ -245,7 +245,7 @@ def info(file: opt.ModelFile, as_json: opt.AsJson = False, device: opt.Device = 
 
 
 def _show_report(file: Path, model: "ProbeModel", report: "Report") -> None:
-    columns = ["PSNR, dB", "lit probes alone, dB", "irradiance, dB", "bytes on disk", "of float32", "bits per probe"]
+    columns = ["PSNR, dB", "lit probes, dB", "irradiance, dB", "bytes on disk", "of float32 size", "bits per probe"]
     rows = console.table(str(file), ["", *columns])
     psnr = (console.number(value, ".2f") for value in (report.psnr, report.psnr_live, report.irradiance_psnr))
     sizes = (f"{report.bytes:,}", f"{report.ratio:.2%}", f"{report.bits_per_probe:.2f}")

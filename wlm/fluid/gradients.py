@@ -22,11 +22,12 @@ from torch.autograd.function import once_differentiable
 from wlm.errors import WlmError
 from wlm.fluid import reversal
 from wlm.fluid.lattice import BODIES, MAX_SPEED, Lattice, blown_up
-from wlm.fluid.solver import Solver
+from wlm.fluid.solver import Solver, ways_of
 from wlm.interop import to_warp
 from wlm.ops.tapes import takes_arrays
 from wlm.ops.tensors import check, check_finite, dense, on_stream
 from wlm_kernels.fluid import advection, advection_adjoint, advection_sources, lattice_adjoint, lattice_links
+from wlm_kernels.fluid.advection_places import trace
 from wlm_kernels.fluid.lattice import QUIET, step_kernel
 from wlm_kernels.fluid.lattice_links import OUTLET, WIND
 from wlm_kernels.fluid.lattice_sets import Slab
@@ -361,15 +362,21 @@ class DifferentiableSolver:
 
     # On the device.
 
+    def _traces(self, zero: bool = False) -> wp.array:
+        size = ways_of(self._setup.scheme) * self.air._cells, 3
+        return _flat((torch.zeros if zero else torch.empty)(size, device=self.air.device), wp.vec3)
+
     def _advect(self, u: wp.array, smoke: _Tensors) -> tuple[_Tensors, _Tensors | None]:
         """Returns smoke after a step without sources, and the prediction of a MacCormack step."""
         setup, predicted, last = self._setup, None, tuple(torch.empty_like(part) for part in smoke)
-        where = [setup.box, u, setup.walls, _fields(smoke)]
+        traces = self._traces()
+        trace(setup.box, u, setup.substeps, traces)
+        where = [setup.box, traces, setup.walls, _fields(smoke)]
         if setup.scheme == "maccormack":
             predicted = tuple(torch.empty_like(part) for part in smoke)
-            advection.advect(*where, _fields(predicted), setup.substeps)
+            advection.advect(*where, _fields(predicted))
         known = None if predicted is None else _fields(predicted)
-        advection.advect(*where, _fields(last), setup.substeps, setup.decay, predicted=known)
+        advection.advect(*where, _fields(last), setup.decay, predicted=known)
         return last, predicted
 
     def _advect_backward(
@@ -377,8 +384,10 @@ class DifferentiableSolver:
     ) -> _Tensors:
         """Returns the gradients to the smoke before a step; that to the velocity is added to `on_u`."""
         setup, on_smoke = self._setup, tuple(torch.zeros_like(part) for part in smoke)
-        where = [setup.box, u, setup.walls, _fields(smoke)]
-        into, decay = [_fields(on_smoke), on_u, setup.substeps], setup.decay
+        traces, on_traces = self._traces(), self._traces(zero=True)
+        trace(setup.box, u, setup.substeps, traces)
+        where = [setup.box, traces, setup.walls, _fields(smoke)]
+        into, decay = [_fields(on_smoke), on_traces], setup.decay
         on_last = _fields(on_out)
         if predicted is not None:
             on_predicted = _fields(tuple(torch.zeros_like(part) for part in smoke))
@@ -386,6 +395,7 @@ class DifferentiableSolver:
             advection_adjoint.advect_backward(*where, on_last, *into, decay, **second)
             on_last, decay = on_predicted, (1.0, 1.0)
         advection_adjoint.advect_backward(*where, on_last, *into, decay)
+        advection_adjoint.trace_backward(setup.box, u, setup.substeps, on_traces, on_u)
         return on_smoke
 
 

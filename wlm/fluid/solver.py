@@ -300,10 +300,14 @@ class Solver:
         self._fire = fire
         self._threshold = threshold
         self._pool = self._make_pool() if bricks else None
+        # Without a pool, the bricks that smoke may reach in a step; the cells of others need only be set to 0.
+        self._near = DENSE if bricks else advection_places.make_bricks(self._box, self._rings, 0.0, str(self.device))
+        self._near.workers = 0
         cells = math.prod(self.shape)
         self._fields = self._pool.fields if self._pool else [self._make_fields(cells) for _ in range(_buffers(scheme))]
         self._touched: tuple[Source, ...] = ()
         self._velocity = self._zeros(lattice.shape, wp.vec3)
+        self._traces = self._zeros((ways_of(scheme), math.prod(lattice.shape)), wp.vec3).flatten()
         if wind is not None and not any((face.kind == WIND).any() for face in lattice.faces.values()):
             raise ValueError("wind: expected a lattice with a face for it (set_wind), got none")
         self._confinement, self._turbulence, self._wind = confinement, turbulence, wind
@@ -698,14 +702,21 @@ class Solver:
                 advection_sources.add_source(*where, fixed=source.fixed, bricks=self._bricks, only_mark=only_mark)
 
     def _carry(self) -> None:
-        decays, where = (self._decay, (1.0, 1.0)), [self._box, self._velocity.flatten(), self._walls[0]]
+        air = [self._box, self._velocity.flatten(), self.substeps, self._traces]
+        decays, where = (self._decay, (1.0, 1.0)), [self._box, self._traces, self._walls[0]]
         for decay, buffers in zip(decays, zip(*map(self._carried, self._fields), strict=True), strict=False):
             now, predicted, out = buffers[0], buffers[1], buffers[-1]
+            bricks = self._bricks
+            if self._pool is None:
+                bricks = self._near
+                self._on_slabs(advection.mark_smoke, self._box, now, bricks)
+                advection_places.choose(self._box, bricks)
+            self._on_slabs(advection_places.trace, *air, bricks)
             if self.scheme == "maccormack":
-                self._on_slabs(advection.advect, *where, now, predicted, self.substeps, bricks=self._bricks)
-                self._on_slabs(advection.advect, *where, now, out, self.substeps, decay, self._bricks, predicted)
+                self._on_slabs(advection.advect, *where, now, predicted, bricks=bricks)
+                self._on_slabs(advection.advect, *where, now, out, decay, bricks, predicted)
             else:
-                self._on_slabs(advection.advect, *where, now, out, self.substeps, decay, self._bricks)
+                self._on_slabs(advection.advect, *where, now, out, decay, bricks)
         self._fields[:] = self._fields[::-1]
 
     def _on_slabs(self, compute: Callable[..., None], *args, **settings) -> None:
@@ -726,12 +737,15 @@ class Solver:
     def _bricks(self) -> advection_places.Bricks:
         return DENSE if self._pool is None else self._pool.bricks
 
-    def _make_pool(self) -> BrickPool:
+    @property
+    def _rings(self) -> int:
         # Smoke also moves by a cell of the lattice when an obstacle leaves it.
         reach = max(_SOUND * self.substeps, float(bool(self.obstacles))) * self._box.refinement
-        rings = advection_places.rings_for(reach)
+        return advection_places.rings_for(reach)
+
+    def _make_pool(self) -> BrickPool:
         return BrickPool(
-            self._box, rings, self._threshold, self._make_fields, _buffers(self.scheme), self.lattice.slabs
+            self._box, self._rings, self._threshold, self._make_fields, _buffers(self.scheme), self.lattice.slabs
         )
 
     def _make_fields(self, cells: int) -> advection.Fields:
@@ -741,6 +755,11 @@ class Solver:
 
     def _zeros(self, shape: tuple[int, ...], dtype) -> wp.array:
         return self.lattice.slabs.zeros(shape, dtype)
+
+
+def ways_of(scheme: str) -> int:
+    """Returns 2 for a scheme that traces smoke back and ahead, 1 for one that traces it back alone."""
+    return 2 if scheme == "maccormack" else 1
 
 
 def _buffers(scheme: str) -> int:

@@ -4,8 +4,8 @@
 Read `tests/reference/advection.py` first: it is the same step in float64 NumPy, cell by cell.
 
 - Semi-Lagrangian: rho'(x) = rho(x_d), trilinear, at the departure point x_d = x - dt u(x - dt u(x) / 2), the midpoint
-  rule (second-order Runge-Kutta). Unconditionally stable, no new extrema, first order. The velocity at a midpoint at
-  most `REACH` coarse cells outside the eight velocities around x is extrapolated from them.
+  rule (second-order Runge-Kutta). Unconditionally stable, no new extrema, first order. x_d - x is computed at the
+  centres of coarse cells (`advection_places.trace`) and is trilinear between them, as the velocities are.
 - MacCormack (Selle et al. 2008): with A a semi-Lagrangian step and A* the step back in time, rho' = A rho + (rho - A* A
   rho) / 2, clamped to the eight values that A interpolates. Second order where the field is smooth.
 
@@ -44,16 +44,12 @@ from wlm_kernels.fluid.advection_places import (
     Box,
     Bricks,
     Stencil,
-    TrilinearVelocity,
     beyond_open_face,
     clip_at_solid,
-    evaluate,
-    fetch,
     in_domain,
-    in_reach,
+    interpolate_vectors,
     into_domain,
     is_solid,
-    line_along_x,
     lowest_cell,
     pair,
     place_at,
@@ -61,7 +57,7 @@ from wlm_kernels.fluid.advection_places import (
     side_of,
     stencil,
     stored_index,
-    trace_back,
+    vector_at,
     wall_at,
 )
 from wlm_kernels.fluid.lattice_sets import Slab, cell_of, index_of
@@ -139,6 +135,12 @@ class Fields:
         struct = fields_struct(self.density.dtype)()
         struct.density, struct.temperature = self.density, self.temperature
         return struct
+
+
+@wp.func
+def run_of_brick(box: Box, brick: int, i: int) -> wp.vec3i:
+    """Returns the first of the cells along x in run i of a brick."""
+    return BRICK * cell_of(box.bricks, brick) + wp.vec3i(0, i // BRICK, i % BRICK)
 
 
 @functools.cache
@@ -279,20 +281,13 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
         return wp.max(wp.abs(away)) <= 0.5 * float(box.refinement)
 
     @wp.func
-    def departure_point(
-        box: Box,
-        u: wp.array1d[wp.vec3],
-        walls: wp.array1d[wp.uint8],
-        around: TrilinearVelocity,
-        f: wp.vec3,
-        x: wp.vec3,
-        v: wp.vec3,
-        dt: float,
-        wall: wp.uint8,
+    def end_of_trace(
+        box: Box, traces: wp.array1d[wp.vec3], walls: wp.array1d[wp.uint8], x: wp.vec3, at: Stencil, wall: wp.uint8
     ):
-        """Traces a point x back in time. Returns the end of the trace within the domain, whether the trace left the
-        domain through an open face, and whether its end is beside a solid; `wall` is the mark of the cell of x."""
-        end = trace_back(box, u, around, f, x, v, dt)
+        """Traces a point x by the traces of the coarse cells around it. Returns the end within the domain, whether the
+        trace left the domain through an open face, and whether its end is beside a solid; `wall` is the mark of the
+        cell of x."""
+        end = x + interpolate_vectors(traces, at)
         p = wp.vec3(end)
         left = bool(False)
         beside = bool(False)
@@ -315,11 +310,10 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
         bricks: Bricks,
         cell: wp.vec3i,
         i: int,
-        u: wp.array1d[wp.vec3],
+        traces: wp.array1d[wp.vec3],
         walls: wp.array1d[wp.uint8],
         fields: fields_type,
         predicted: fields_type,
-        dt: float,
     ):
         """Returns the density and the temperature of any cell, of index i, after a step, before their decay."""
         smoke = float(0.0)
@@ -330,9 +324,7 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
             wall = wall_at(box, walls, x)
         if wall != SOLID:
             start = stencil(box.coarse, box.periodic, box.voxel * x)
-            around = fetch(u, start)
-            v = evaluate(around, start.f)
-            p, left, beside = departure_point(box, u, walls, around, start.f, x, v, dt, wall)
+            p, left, beside = end_of_trace(box, traces, walls, x, start, wall)
             at = corners_around(box, bricks, p)
             if wp.static(correcting):
                 smoke = value_at(predicted.density, i)
@@ -340,7 +332,8 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
                     heat = value_at(predicted.temperature, i)
                 uncorrected = left or beside
                 if not uncorrected:
-                    q, left_q, beside_q = departure_point(box, u, walls, around, start.f, x, v, -dt, wall)
+                    start.base += box.coarse[0] * box.coarse[1] * box.coarse[2]
+                    q, left_q, beside_q = end_of_trace(box, traces, walls, x, start, wall)
                     uncorrected = left_q or beside_q
                 if not uncorrected:
                     to = corners_around(box, bricks, q)
@@ -375,16 +368,27 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
         return corners_of(box, bricks, x, y, z, wp.vec3i(1, 1, 1), f), inside
 
     @wp.func
+    def line_along_x(traces: wp.array1d[wp.vec3], at: Stencil):
+        """Returns the trace at the fractions 0, y and z between eight coarse cells, and its slope along x."""
+        near = wp.vec3()
+        far = wp.vec3()
+        for k in range(2):
+            i = at.base + k * at.step[0]
+            a = vector_at(traces, i)
+            a += at.f[2] * (vector_at(traces, i + at.step[2]) - a)
+            b = vector_at(traces, i + at.step[1])
+            b += at.f[2] * (vector_at(traces, i + at.step[1] + at.step[2]) - b)
+            near = wp.vec3(far)
+            far = a + at.f[1] * (b - a)
+        return near, far - near
+
+    @wp.func
     def patch_of(box: Box, i: int) -> int:
         """Returns the coarse cell, -1 or above, between whose centre and the next the centre of a fine cell is."""
         return (2 * i + 1 + box.refinement) // (2 * box.refinement) - 1
 
     @wp.func
-    def first_of_run(box: Box, bricks: Bricks, begin: int, i: int, k: int) -> wp.vec3i:
-        if wp.static(in_bricks):
-            r = i % _BRICK_RUNS
-            b = cell_of(box.bricks, bricks.listed[k])
-            return BRICK * b + wp.vec3i(0, r // BRICK, r % BRICK)
+    def run_of_tile(box: Box, begin: int, i: int) -> wp.vec3i:
         tile = cell_of(
             wp.vec3i(1, (box.n[1] + _TILE - 1) // _TILE, (box.n[2] + _TILE - 1) // _TILE), i // (_TILE * _TILE)
         )
@@ -396,11 +400,10 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
         box: Box,
         first: wp.vec3i,
         last: int,
-        u: wp.array1d[wp.vec3],
+        traces: wp.array1d[wp.vec3],
         walls: wp.array1d[wp.uint8],
         fields: fields_type,
         predicted: fields_type,
-        dt: float,
         decay: wp.vec2,
         bricks: Bricks,
         out: fields_type,
@@ -408,7 +411,6 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
         """Advects up to `run` cells along x, below cell `last`, and returns their largest density or temperature."""
         most = float(0.0)
         others = int(0)
-        fine = dt * float(box.refinement)
         sheet = wp.where(wp.static(in_bricks), BRICK * BRICK, box.n[1] * box.n[2])
         x = int(first[0])
         end = wp.min(first[0] + wp.static(run), last)
@@ -422,12 +424,15 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
         fy = box.voxel * (float(first[1]) + 0.5) - 0.5 - float(patch_y)
         fz = box.voxel * (float(first[2]) + 0.5) - 0.5 - float(patch_z)
         corners = Stencil()
+        corners.f = wp.vec3(0.0, fy, fz)
         while x < end:
             low_x, along_x = pair(patch, box.coarse[0], box.periodic[0])
             corners.base = (low_x * box.coarse[1] + low_y) * box.coarse[2] + low_z
             corners.step = wp.vec3i(along_x * box.coarse[1] * box.coarse[2], along_y * box.coarse[2], along_z)
-            around = fetch(u, corners)
-            near, slope = line_along_x(around, fy, fz)
+            near, slope = line_along_x(traces, corners)
+            if wp.static(correcting):
+                corners.base += box.coarse[0] * box.coarse[1] * box.coarse[2]
+                near_ahead, slope_ahead = line_along_x(traces, corners)
             centre = float(patch) + 0.5
             stop = wp.min(end, (2 * patch + 3) * box.refinement // 2)
             for k in range(x, stop):
@@ -437,15 +442,12 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
                     if wp.static(correcting):
                         prefetch(predicted.density, ahead)
                 cell = wp.vec3(float(k), float(first[1]), float(first[2]))
-                f = wp.vec3(box.voxel * (cell[0] + 0.5) - centre, fy, fz)
+                fx = box.voxel * (cell[0] + 0.5) - centre
                 # The order of the tests matters: it decides whether the compiler makes branches of them.
                 if wp.static(solids):
                     wall = wall_at(box, walls, cell + wp.vec3(0.5, 0.5, 0.5))
-                half = 0.5 * dt * (slope * f[0] + near)
-                simple = in_reach(f - half)
-                away = fine * evaluate(around, f - half)
-                at, inside = between_cells(box, bricks, cell - away)
-                simple = simple and inside
+                away = slope * fx + near
+                at, simple = between_cells(box, bricks, cell + away)
                 if wp.static(solids):
                     simple = simple and wall == FREE and is_short(box, away)
                 smoke = float(0.0)
@@ -461,9 +463,8 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
                             varies = varies or coldest < hottest
                         # Nothing is corrected between equal values.
                         if varies:
-                            away = -fine * evaluate(around, f + half)
-                            to, inside = between_cells(box, bricks, cell - away)
-                            simple = in_reach(f + half) and inside
+                            away = slope_ahead * fx + near_ahead
+                            to, simple = between_cells(box, bricks, cell + away)
                             if wp.static(solids):
                                 simple = simple and is_short(box, away)
                             if simple:
@@ -486,19 +487,28 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
                 if (others >> k) & 1 != 0:
                     any_cell = wp.vec3i(first[0] + k, first[1], first[2])
                     at_cell = begin + k * sheet
-                    any_smoke, any_heat = carry_cell(box, bricks, any_cell, at_cell, u, walls, fields, predicted, dt)
+                    any_smoke, any_heat = carry_cell(box, bricks, any_cell, at_cell, traces, walls, fields, predicted)
                     most = wp.max(most, write(at_cell, any_smoke, any_heat, decay, out))
         return most
+
+    @wp.func
+    def is_needed(box: Box, bricks: Bricks, first: wp.vec3i, last: int) -> bool:
+        """Tests whether smoke may reach the cells from `first` to below `last` along x."""
+        needed = bool(bricks.places.shape[0] == 0)
+        for x in range(first[0] // BRICK, (last - 1) // BRICK + 1):
+            if not needed:
+                b = index_of(box.bricks, wp.vec3i(x, first[1] // BRICK, first[2] // BRICK))
+                needed = place_at(bricks.places, b) != 0
+        return needed
 
     @wp.kernel(module="unique", module_options=_OPTIONS, launch_bounds=_BRICK_BOUNDS if in_bricks else _BOUNDS)
     def carry(
         # in:
         box: Box,
-        u: wp.array1d[wp.vec3],
+        traces: wp.array1d[wp.vec3],
         walls: wp.array1d[wp.uint8],
         fields: fields_type,
         predicted: fields_type,
-        dt: float,
         decay: wp.vec2,
         begin: int,
         end: int,
@@ -509,26 +519,73 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
         i = wp.tid()
         if wp.static(in_bricks):
             for k in range(i // _BRICK_RUNS, bricks.counts[0], bricks.workers):
-                first = first_of_run(box, bricks, begin, i, k)
+                first = run_of_brick(box, bricks.listed[k], i % _BRICK_RUNS)
                 if first[0] < box.n[0] and first[1] < box.n[1] and first[2] < box.n[2]:
-                    most = carry_run(box, first, end, u, walls, fields, predicted, dt, decay, bricks, out)
+                    most = carry_run(box, first, end, traces, walls, fields, predicted, decay, bricks, out)
                     if most > bricks.threshold:
                         bricks.busy[bricks.listed[k]] = 1
         else:
-            first = first_of_run(box, bricks, begin, i, 0)
+            first = run_of_tile(box, begin, i)
             if first[1] < box.n[1] and first[2] < box.n[2]:
-                carry_run(box, first, end, u, walls, fields, predicted, dt, decay, bricks, out)
+                last = wp.min(first[0] + _RUN, end)
+                if is_needed(box, bricks, first, last):
+                    carry_run(box, first, end, traces, walls, fields, predicted, decay, bricks, out)
+                else:
+                    for x in range(first[0], last):
+                        write(index_of(box.n, wp.vec3i(x, first[1], first[2])), 0.0, 0.0, decay, out)
 
     return carry
 
 
+@functools.cache
+def mark_kernel(stored: type) -> wp.Kernel:
+    """Builds (once) a kernel that marks bricks in which smoke of the type `stored` is not 0; a thread reads 8 cells."""
+    fields_type = fields_struct(stored)
+
+    @wp.func_native("return fabsf((float)field.data[i]);")
+    def size_at(field: wp.array1d[stored], i: int) -> float: ...
+
+    @wp.kernel(module="unique", module_options={"enable_backward": False})
+    def mark(
+        # in:
+        box: Box,
+        fields: fields_type,
+        begin: int,
+        # out:
+        bricks: Bricks,
+    ):
+        b = begin + wp.tid() // _BRICK_RUNS
+        first = run_of_brick(box, b, wp.tid() % _BRICK_RUNS)
+        if first[1] < box.n[1] and first[2] < box.n[2]:
+            total = float(0.0)
+            for k in range(BRICK):
+                # Beyond the domain, its last cell is read again.
+                i = index_of(box.n, wp.vec3i(wp.min(first[0] + k, box.n[0] - 1), first[1], first[2]))
+                total += size_at(fields.density, i)
+                if fields.temperature.shape[0] > 0:
+                    total += size_at(fields.temperature, i)
+            # Also true for NaN.
+            if not (total == 0.0):
+                bricks.busy[b] = 1
+
+    return mark
+
+
+def mark_smoke(box: Box, fields: Fields, bricks: Bricks, slab: Slab | None = None) -> None:
+    """Marks as busy the bricks of smoke without a pool in which a density or temperature is not 0, for
+    `advection_places.choose`. `slab` are the coarse cells in which smoke is looked for; default all."""
+    slab, plane = slab or Slab(fields.density.device, 0, box.coarse[0]), box.bricks[1] * box.bricks[2]
+    begin, end = slab.begin * box.refinement // BRICK, -(-slab.end * box.refinement // BRICK)
+    kernel, threads = mark_kernel(fields.density.dtype), (end - begin) * plane * int(_BRICK_RUNS)
+    wp.launch(kernel, threads, inputs=[box, fields.arrays, begin * plane], outputs=[bricks], device=slab.device)
+
+
 def advect(
     box: Box,
-    velocity: wp.array,
+    traces: wp.array,
     walls: wp.array,
     fields: Fields,
     out: Fields,
-    dt: float,
     decay: tuple[float, float] = (1.0, 1.0),
     bricks: Bricks = DENSE,
     predicted: Fields | None = None,
@@ -538,18 +595,18 @@ def advect(
 
     Args:
         box: The domain, see `advection_places.make_box`.
-        velocity: Velocity of the air, vec3 [coarse cells], coarse cells per lattice step.
+        traces: The ways of the smoke, from `advection_places.trace`; back and ahead with `predicted`.
         walls: uint8 [coarse cells] from `advection_places.mark_walls`, or [0] without solids.
         fields: The smoke before the step.
         out: The smoke after the step, in other arrays of the same shapes and types.
-        dt: Duration in lattice steps.
         decay: Factors by which density and temperature are multiplied, at most 1; (1, 1) in the first half of a
             MacCormack step.
-        bricks: The bricks to compute, stored by `advection_sources.store`; default all cells.
+        bricks: The bricks to compute, stored by `advection_sources.store`, or chosen by `advection_places.choose`; in
+            the latter case, smoke elsewhere becomes 0. Default all cells.
         predicted: The result of the first half, in a third set of arrays.
         slab: The coarse cells to compute, without bricks; default all.
     """
-    slab = slab or Slab(velocity.device, 0, box.coarse[0])
+    slab = slab or Slab(traces.device, 0, box.coarse[0])
     begin, end = slab.begin * box.refinement, slab.end * box.refinement
     stored, solids, hot = fields.density.dtype, walls.shape[0] > 0, fields.temperature.shape[0] > 0
     kernel = carry_kernel(predicted is not None, stored, bricks.workers > 0, solids, hot)
@@ -557,5 +614,5 @@ def advect(
     threads = bricks.workers * int(_BRICK_RUNS) or tiles * _TILE * _TILE
     # A semi-Lagrangian step does not read the prediction.
     smoke = [fields.arrays, (predicted or fields).arrays]
-    inputs = [box, velocity, walls, *smoke, float(dt), wp.vec2(*decay), begin, end, bricks]
+    inputs = [box, traces, walls, *smoke, wp.vec2(*decay), begin, end, bricks]
     wp.launch(kernel, threads, inputs=inputs, outputs=[out.arrays], device=slab.device)

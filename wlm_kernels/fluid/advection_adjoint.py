@@ -20,18 +20,17 @@ import warp as wp
 from wlm_kernels.fluid.advection import Fields, fields_struct
 from wlm_kernels.fluid.advection_places import (
     FREE,
-    REACH,
     SOLID,
     Box,
     Stencil,
     beyond_open_face,
     clip_at_solid,
     corner,
-    evaluate,
-    fetch,
     in_domain,
+    interpolate_vectors,
     into_domain,
     is_solid,
+    midpoint,
     side_of,
     stencil,
     wall_at,
@@ -41,7 +40,6 @@ from wlm_kernels.fluid.lattice_sets import cell_of, index_of
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 4})
 
-_REACH = wp.constant(REACH)
 _FieldArrays = fields_struct(wp.float32)
 
 
@@ -49,15 +47,12 @@ _FieldArrays = fields_struct(wp.float32)
 class Trace:
     """A trace from a cell back in time, with what its gradient needs.
 
-    It reads the velocities `start` at the cell and `middle` at its midpoint; `passes` is the derivative of the position
-    of `middle` by that of the midpoint, along each axis, 0 or 1. Its `end` is within the domain; `stays` is its
-    derivative by the unclamped and uncut end, along each axis. `left` tells whether it left the domain through an open
-    face, `beside` whether its end is beside a solid.
+    It is between the traces of the coarse cells `start`. Its `end` is within the domain; `stays` is its derivative by
+    the unclamped and uncut end, along each axis. `left` tells whether it left the domain through an open face, `beside`
+    whether its end is beside a solid.
     """
 
     start: Stencil
-    middle: Stencil
-    passes: wp.vec3
     end: wp.vec3
     stays: wp.vec3
     left: bool
@@ -75,25 +70,12 @@ def _kept_axes(box: Box, x: wp.vec3) -> wp.vec3:
 
 
 @wp.func
-def _trace(box: Box, u: wp.array1d[wp.vec3], walls: wp.array1d[wp.uint8], x: wp.vec3, dt: float) -> Trace:
+def _trace(box: Box, traces: wp.array1d[wp.vec3], walls: wp.array1d[wp.uint8], x: wp.vec3, first: int) -> Trace:
+    """Traces a point x by the traces of the coarse cells from index `first` on."""
     out = Trace()
-    fine = dt * float(box.refinement)
     out.start = stencil(box.coarse, box.periodic, box.voxel * x)
-    around = fetch(u, out.start)
-    v = evaluate(around, out.start.f)
-    half = out.start.f - 0.5 * dt * v
-    w = wp.vec3()
-    if wp.min(half) >= -_REACH and wp.max(half) <= 1.0 + _REACH:
-        out.middle = out.start
-        out.middle.f = half
-        out.passes = wp.vec3(1.0, 1.0, 1.0)
-        w = evaluate(around, half)
-    else:
-        middle = x - 0.5 * fine * v
-        out.passes = _kept_axes(box, middle)
-        out.middle = stencil(box.coarse, box.periodic, box.voxel * into_domain(box, middle))
-        w = evaluate(fetch(u, out.middle), out.middle.f)
-    end = x - fine * w
+    out.start.base += first
+    end = x + interpolate_vectors(traces, out.start)
     out.end = end
     out.stays = wp.vec3(1.0, 1.0, 1.0)
     if not in_domain(box, end):
@@ -128,26 +110,36 @@ def _slope(f: wp.vec3, k: int) -> wp.vec3:
 
 
 @wp.func
-def _velocity_backward(
-    box: Box, u: wp.array1d[wp.vec3], trace: Trace, dt: float, on_end: wp.vec3, on_u: wp.array1d[wp.vec3]
+def _trace_backward(trace: Trace, on_end: wp.vec3, on_traces: wp.array1d[wp.vec3]):
+    """Adds the gradients to the traces of the coarse cells around a trace."""
+    on_way = wp.cw_mul(trace.stays, on_end)
+    for k in range(8):
+        i, weight = corner(trace.start, k)
+        wp.atomic_add(on_traces, i, weight * on_way)
+
+
+@wp.kernel
+def _ways(
+    # in:
+    box: Box,
+    u: wp.array1d[wp.vec3],
+    dt: float,
+    on_traces: wp.array1d[wp.vec3],
+    # in, out:
+    on_u: wp.array1d[wp.vec3],
 ):
-    """Adds the gradients to the velocities that a trace reads."""
-    on_w = -dt * float(box.refinement) * wp.cw_mul(trace.stays, on_end)
-    on_half = wp.vec3()
+    i = wp.tid()
+    start = i % u.shape[0]
+    duration = wp.where(i < u.shape[0], dt, -dt)
+    middle = midpoint(box, u, start, duration)
+    at = stencil(box.coarse, box.periodic, box.voxel * into_domain(box, middle))
+    on_w = -duration * float(box.refinement) * on_traces[i]
+    on_middle = wp.vec3()
     for k in range(8):
-        i, _weight = corner(trace.middle, k)
-        on_half += wp.dot(u[i], on_w) * _slope(trace.middle.f, k)
-    on_v = -0.5 * dt * wp.cw_mul(trace.passes, on_half)
-    # Most traces read the same eight velocities twice.
-    same = trace.middle.base == trace.start.base and trace.middle.step == trace.start.step
-    for k in range(8):
-        i, first = corner(trace.start, k)
-        j, second = corner(trace.middle, k)
-        if same:
-            wp.atomic_add(on_u, i, first * on_v + second * on_w)
-        else:
-            wp.atomic_add(on_u, i, first * on_v)
-            wp.atomic_add(on_u, j, second * on_w)
+        j, weight = corner(at, k)
+        on_middle += wp.dot(u[j], on_w) * _slope(at.f, k)
+        wp.atomic_add(on_u, j, weight * on_w)
+    wp.atomic_add(on_u, start, -0.5 * duration * wp.cw_mul(_kept_axes(box, middle), on_middle))
 
 
 @wp.func
@@ -187,15 +179,11 @@ def _read_backward(
 
 @wp.func
 def _interpolate(field: wp.array1d[float], at: Stencil) -> float:
-    i00 = at.base
-    i01 = at.base + at.step[1]
-    i10 = at.base + at.step[0]
-    i11 = i10 + at.step[1]
-    a = wp.lerp(field[i00], field[i00 + at.step[2]], at.f[2])
-    b = wp.lerp(field[i01], field[i01 + at.step[2]], at.f[2])
-    c = wp.lerp(field[i10], field[i10 + at.step[2]], at.f[2])
-    d = wp.lerp(field[i11], field[i11 + at.step[2]], at.f[2])
-    return wp.lerp(wp.lerp(a, b, at.f[1]), wp.lerp(c, d, at.f[1]), at.f[0])
+    total = float(0.0)
+    for k in range(8):
+        i, weight = corner(at, k)
+        total += weight * field[i]
+    return total
 
 
 @wp.func
@@ -245,15 +233,14 @@ def _centre(p: wp.vec3i) -> wp.vec3:
 def _carry(
     # in:
     box: Box,
-    u: wp.array1d[wp.vec3],
+    traces: wp.array1d[wp.vec3],
     walls: wp.array1d[wp.uint8],
     fields: _FieldArrays,
-    dt: float,
     decay: wp.vec2,
     on_out: _FieldArrays,
     # in, out:
     on_fields: _FieldArrays,
-    on_u: wp.array1d[wp.vec3],
+    on_traces: wp.array1d[wp.vec3],
 ):
     i = wp.tid()
     hot = fields.temperature.shape[0] > 0
@@ -266,30 +253,29 @@ def _carry(
     p = cell_of(box.n, i)
     if is_solid(box, walls, p):
         return
-    trace = _trace(box, u, walls, _centre(p), dt)
+    trace = _trace(box, traces, walls, _centre(p), 0)
     if trace.left:
         return
     on_end = _read_backward(box, walls, fields.density, trace, smoke, on_fields.density)
     if hot:
         on_end += _read_backward(box, walls, fields.temperature, trace, heat, on_fields.temperature)
-    _velocity_backward(box, u, trace, dt, on_end, on_u)
+    _trace_backward(trace, on_end, on_traces)
 
 
 @wp.kernel
 def _correct(
     # in:
     box: Box,
-    u: wp.array1d[wp.vec3],
+    traces: wp.array1d[wp.vec3],
     walls: wp.array1d[wp.uint8],
     fields: _FieldArrays,
     predicted: _FieldArrays,
-    dt: float,
     decay: wp.vec2,
     on_out: _FieldArrays,
     # in, out:
     on_fields: _FieldArrays,
     on_predicted: _FieldArrays,
-    on_u: wp.array1d[wp.vec3],
+    on_traces: wp.array1d[wp.vec3],
 ):
     i = wp.tid()
     hot = fields.temperature.shape[0] > 0
@@ -302,8 +288,8 @@ def _correct(
     p = cell_of(box.n, i)
     if is_solid(box, walls, p):
         return
-    source = _trace(box, u, walls, _centre(p), dt)
-    target = _trace(box, u, walls, _centre(p), -dt)
+    source = _trace(box, traces, walls, _centre(p), 0)
+    target = _trace(box, traces, walls, _centre(p), traces.shape[0] // 2)
     if source.left or target.left or source.beside or target.beside:
         wp.atomic_add(on_predicted.density, i, smoke)
         if hot:
@@ -335,7 +321,7 @@ def _correct(
             on_fields.temperature,
             on_predicted.temperature,
         )
-    _velocity_backward(box, u, target, -dt, on_end, on_u)
+    _trace_backward(target, on_end, on_traces)
 
 
 @wp.kernel
@@ -387,15 +373,21 @@ def _lift(
         on_fields.temperature[i] += volume * wp.dot(by_temperature, g)
 
 
+def trace_backward(box: Box, velocity: wp.array, dt: float, on_traces: wp.array, on_velocity: wp.array) -> None:
+    """Adds the gradients of `advection_places.trace`, which describes the first arguments, to `on_velocity`, vec3
+    [coarse cells]; `on_traces` are the gradients to its result."""
+    inputs = [box, velocity, float(dt), on_traces]
+    wp.launch(_ways, on_traces.shape[0], inputs=inputs, outputs=[on_velocity], device=on_traces.device)
+
+
 def advect_backward(
     box: Box,
-    velocity: wp.array,
+    traces: wp.array,
     walls: wp.array,
     fields: Fields,
     on_out: Fields,
     on_fields: Fields,
-    on_velocity: wp.array,
-    dt: float,
+    on_traces: wp.array,
     decay: tuple[float, float] = (1.0, 1.0),
     predicted: Fields | None = None,
     on_predicted: Fields | None = None,
@@ -403,17 +395,16 @@ def advect_backward(
     """Adds the gradients of `advection.advect`, which describes the first arguments, in float32, or with `predicted`
     and `on_predicted` those of its second half.
 
-    `on_out` are the gradients to its result. Added to are `on_fields`, `on_velocity`, vec3 [coarse cells], and
-    `on_predicted`.
+    `on_out` are the gradients to its result. Added to are `on_fields`, `on_traces`, like `traces`, and `on_predicted`.
     """
     cells, device = fields.density.shape[0], fields.density.device
-    settings = [float(dt), wp.vec2(*decay), on_out.arrays]
+    settings = [wp.vec2(*decay), on_out.arrays]
     if predicted is None or on_predicted is None:
-        inputs, outputs = [box, velocity, walls, fields.arrays, *settings], [on_fields.arrays, on_velocity]
+        inputs, outputs = [box, traces, walls, fields.arrays, *settings], [on_fields.arrays, on_traces]
         wp.launch(_carry, cells, inputs=inputs, outputs=outputs, device=device)
     else:
-        inputs = [box, velocity, walls, fields.arrays, predicted.arrays, *settings]
-        outputs = [on_fields.arrays, on_predicted.arrays, on_velocity]
+        inputs = [box, traces, walls, fields.arrays, predicted.arrays, *settings]
+        outputs = [on_fields.arrays, on_predicted.arrays, on_traces]
         wp.launch(_correct, cells, inputs=inputs, outputs=outputs, device=device)
 
 

@@ -16,7 +16,7 @@ from collections.abc import Sequence
 
 import warp as wp
 
-from wlm_kernels.fluid.lattice_sets import cell_of, index_of
+from wlm_kernels.fluid.lattice_sets import Slab, cell_of, index_of, launch_slab
 
 wp.set_module_options({"enable_backward": False})
 
@@ -26,14 +26,9 @@ PERIODIC, OPEN, CLOSED = 0, 1, 2
 BRICK, CELLS = 8, 512
 """Cells along an edge of a brick, and in a brick."""
 
-REACH = 0.25
-"""Distance in coarse cells by which the midpoint of a trace may be outside the eight velocities around its start and
-still be extrapolated from them: reading the next eight, which are mostly the same, would double the time."""
-
 FREE, _BESIDE, SOLID = wp.constant(wp.uint8(0)), wp.constant(wp.uint8(1)), wp.constant(wp.uint8(2))
 _OPEN = wp.constant(OPEN)
 _HALVINGS = wp.constant(6)
-_REACH = wp.constant(REACH)
 # Groups of threads that share the list of bricks; enough to fill any GPU.
 _WORKERS = 8192
 
@@ -70,11 +65,12 @@ class Bricks:
 
     Attributes:
         rings: Distance in bricks by which smoke may move beyond a busy brick in a step.
-        workers: Groups of threads that share the listed bricks; 0: there are no bricks, all cells are stored.
+        workers: Groups of threads that share the listed bricks; 0: there is no pool, all cells are stored.
         threshold: Largest value of a brick that counts as empty.
         busy: int [B], 1 where a value above the threshold has been written since the last `store`, else 0; between
             `relist` and `store` plus 2 in bricks that are listed.
-        places: int [B], the place of each listed brick in the pool; 0 for all others.
+        places: int [B], the place of each listed brick in the pool, or 1 in each chosen brick without a pool; 0 for all
+            others; [0]: all cells are computed.
         listed: int [B], its first `counts[0]` elements are the indices of the listed bricks, in any order.
         fresh: int [B], its first `counts[1]` elements are the listed bricks that have no place yet.
         counts: int [2].
@@ -105,20 +101,6 @@ class Stencil:
     base: int
     step: wp.vec3i
     f: wp.vec3
-
-
-@wp.struct
-class TrilinearVelocity:
-    """Coefficients of the trilinear polynomial through eight velocities, in the fractions 0 to 1 between them."""
-
-    c: wp.vec3
-    x: wp.vec3
-    y: wp.vec3
-    z: wp.vec3
-    xy: wp.vec3
-    xz: wp.vec3
-    yz: wp.vec3
-    xyz: wp.vec3
 
 
 @wp.func
@@ -213,56 +195,17 @@ def corner(at: Stencil, k: int):
     return at.base + wp.dot(side, at.step), share_of(side, at.f)
 
 
-@wp.func_native("return u.data[i];")
-def _velocity(u: wp.array1d[wp.vec3], i: int) -> wp.vec3: ...
+@wp.func_native("return vectors.data[i];")
+def vector_at(vectors: wp.array1d[wp.vec3], i: int) -> wp.vec3: ...
 
 
 @wp.func
-def fetch(u: wp.array1d[wp.vec3], at: Stencil) -> TrilinearVelocity:
-    """Reads the velocities of eight coarse cells and returns the polynomial that interpolates them."""
-    row01 = at.base + at.step[1]
-    row10 = at.base + at.step[0]
-    row11 = row10 + at.step[1]
-    a = _velocity(u, at.base)
-    b = _velocity(u, at.base + at.step[2]) - a
-    c = _velocity(u, row01)
-    d = _velocity(u, row01 + at.step[2]) - c
-    e = _velocity(u, row10)
-    f = _velocity(u, row10 + at.step[2]) - e
-    g = _velocity(u, row11)
-    h = _velocity(u, row11 + at.step[2]) - g
-    out = TrilinearVelocity()
-    out.c = a
-    out.z = b
-    out.y = c - a
-    out.yz = d - b
-    out.x = e - a
-    out.xz = f - b
-    out.xy = (g - e) - (c - a)
-    out.xyz = (h - f) - (d - b)
-    return out
-
-
-@wp.func
-def line_along_x(around: TrilinearVelocity, y: float, z: float):
-    """Returns the velocity at the fractions 0, y and z, and its slope along x."""
-    near = (around.yz * z + around.y) * y + (around.z * z + around.c)
-    slope = (around.xyz * z + around.xy) * y + (around.xz * z + around.x)
-    return near, slope
-
-
-@wp.func
-def evaluate(around: TrilinearVelocity, f: wp.vec3) -> wp.vec3:
-    near, slope = line_along_x(around, f[1], f[2])
-    return slope * f[0] + near
-
-
-@wp.func
-def in_reach(half: wp.vec3) -> bool:
-    """Tests whether the eight velocities around a start also give that at its midpoint, at these fractions."""
-    least = wp.min(half[0], wp.min(half[1], half[2]))
-    most = wp.max(half[0], wp.max(half[1], half[2]))
-    return least >= -_REACH and most <= 1.0 + _REACH
+def interpolate_vectors(vectors: wp.array1d[wp.vec3], at: Stencil) -> wp.vec3:
+    total = wp.vec3()
+    for k in range(8):
+        i, weight = corner(at, k)
+        total += weight * vector_at(vectors, i)
+    return total
 
 
 @wp.func
@@ -321,22 +264,11 @@ def is_solid(box: Box, walls: wp.array1d[wp.uint8], cell: wp.vec3i) -> bool:
 
 
 @wp.func
-def trace_back(
-    box: Box, u: wp.array1d[wp.vec3], around: TrilinearVelocity, f: wp.vec3, x: wp.vec3, v: wp.vec3, dt: float
-) -> wp.vec3:
-    """Computes the departure point x - dt u(x - dt v / 2) in fine cells.
-
-    `around` has the velocities around x, f the fractions of x between them, and v = u(x) in coarse cells per step.
-    """
-    fine = dt * float(box.refinement)
-    half = f - 0.5 * dt * v
-    w = wp.vec3()
-    if in_reach(half):
-        w = evaluate(around, half)
-    else:
-        at = stencil(box.coarse, box.periodic, box.voxel * into_domain(box, x - 0.5 * fine * v))
-        w = evaluate(fetch(u, at), at.f)
-    return x - fine * w
+def midpoint(box: Box, u: wp.array1d[wp.vec3], i: int, dt: float) -> wp.vec3:
+    """Returns the midpoint of the trace from the centre of coarse cell i back in time, before it is clamped."""
+    p = cell_of(box.coarse, i)
+    r = float(box.refinement)
+    return r * (wp.vec3(float(p[0]) + 0.5, float(p[1]) + 0.5, float(p[2]) + 0.5) - 0.5 * dt * u[i])
 
 
 @wp.func
@@ -369,6 +301,68 @@ def make_box(coarse: Sequence[int], refinement: int, ends: Sequence[tuple[int, i
     box.below, box.above = wp.vec3i(*(low for low, _ in ends)), wp.vec3i(*(high for _, high in ends))
     box.bricks = wp.vec3i(*(-(-size // BRICK) for size in fine))
     return box
+
+
+@wp.func
+def _is_used(box: Box, bricks: Bricks, p: wp.vec3i) -> bool:
+    """Tests whether a chosen brick may be less than a coarse cell from the centre of a coarse cell."""
+    used = bool(bricks.places.shape[0] == 0)
+    low = wp.vec3i()
+    high = wp.vec3i()
+    for a in range(3):
+        least = box.refinement * p[a] - box.refinement // 2 - 1
+        most = box.refinement * (p[a] + 1) + box.refinement // 2
+        used = used or (box.periodic[a] != 0 and (least < 0 or most >= box.n[a]))
+        low[a] = wp.max(least, 0) // BRICK
+        high[a] = wp.min(most, box.n[a] - 1) // BRICK + 1
+    if not used:
+        for x in range(low[0], high[0]):
+            for y in range(low[1], high[1]):
+                for z in range(low[2], high[2]):
+                    used = used or place_at(bricks.places, index_of(box.bricks, wp.vec3i(x, y, z))) != 0
+    return used
+
+
+@wp.kernel
+def _trace(
+    # in:
+    first: int,
+    box: Box,
+    u: wp.array1d[wp.vec3],
+    dt: float,
+    bricks: Bricks,
+    # out:
+    traces: wp.array1d[wp.vec3],
+):
+    i = first + wp.tid()
+    # Where no smoke is, any way is right that does not lead to some.
+    duration = wp.where(_is_used(box, bricks, cell_of(box.coarse, i)), dt, 0.0)
+    for at in range(i, traces.shape[0], u.shape[0]):
+        way = wp.vec3()
+        if duration != 0.0:
+            middle = into_domain(box, midpoint(box, u, i, duration))
+            around = stencil(box.coarse, box.periodic, box.voxel * middle)
+            way = -duration * float(box.refinement) * interpolate_vectors(u, around)
+        traces[at] = way
+        duration = -duration
+
+
+def trace(
+    box: Box, velocity: wp.array, dt: float, traces: wp.array, bricks: Bricks = DENSE, slab: Slab | None = None
+) -> None:
+    """Computes the ways of smoke from and to the centres of coarse cells, by the midpoint rule.
+
+    Args:
+        box: The domain, of N coarse cells.
+        velocity: Velocity of the air, vec3 [N], coarse cells per lattice step.
+        dt: Duration in lattice steps.
+        traces: vec3 [N] or [2 N], written: the ways from the centres to their departure points, in fine cells; then
+            those to the points where smoke goes from the centres in the same time.
+        bricks: The bricks that the step computes; elsewhere the ways are 0. Default all cells.
+        slab: The coarse cells to compute; default all.
+    """
+    slab = slab or Slab(traces.device, 0, box.coarse[0])
+    launch_slab(_trace, box.coarse, slab, [box, velocity, float(dt), bricks], [traces])
 
 
 @wp.kernel
@@ -470,6 +464,23 @@ def relist(box: Box, bricks: Bricks) -> None:
     bricks.counts.zero_()
     wp.launch(_spread, bricks.busy.shape, inputs=[box, bricks], device=bricks.busy.device)
     wp.launch(_list, bricks.busy.shape, inputs=[bricks], device=bricks.busy.device)
+
+
+@wp.kernel
+def _choose(
+    # in, out:
+    bricks: Bricks,
+):
+    b = wp.tid()
+    bricks.places[b] = wp.min(bricks.busy[b], 1)
+    bricks.busy[b] = 0
+
+
+def choose(box: Box, bricks: Bricks) -> None:
+    """Chooses busy bricks, and those that smoke in them may reach, for the next step, where no pool stores the smoke:
+    their `places` are 1 and those of others 0. Then no brick is busy."""
+    wp.launch(_spread, bricks.busy.shape, inputs=[box, bricks], device=bricks.busy.device)
+    wp.launch(_choose, bricks.busy.shape, inputs=[bricks], device=bricks.busy.device)
 
 
 @wp.kernel

@@ -115,15 +115,18 @@ def link_kernels(lattice_name: str, storage: str, balance: bool) -> LinkKernels:
     count, options = len(c), {"enable_backward": False, "max_unroll": 32}
 
     @wp.func
+    def moments_at(f: wp.array2d[stored], i: int):
+        # The loop is unrolled: the latency of reads one after the other would take longer than a step.
+        g = vec()
+        for r in range(wp.static(count)):
+            g[r] = load(f, r, i) * wp.static(STORAGES[storage][1])
+        return moments(g)
+
+    @wp.func
     def outflow(
         t: Tables, n: wp.vec3i, bounded: wp.vec3i, f: wp.array2d[stored], i: int, q: int, kind: int, term: float
     ) -> float:
-        drho = float(0.0)
-        j = wp.vec3()
-        for k in range(t.w.shape[0]):
-            g = load(f, k, i)
-            drho += g
-            j += g * wp.vec3(float(t.c[k][0]), float(t.c[k][1]), float(t.c[k][2]))
+        drho, j, _diagonal, _off = moments_at(f, i)
         u = j / (1.0 + drho)
         source = cell_of(n, i) - t.c[q]
         hold = float(1.0)
@@ -274,17 +277,13 @@ def link_kernels(lattice_name: str, storage: str, balance: bool) -> LinkKernels:
         p: wp.vec3i,
         f: wp.array2d[stored],
     ):
-        # Loops are unrolled: the latency of reads one after the other would take longer than a step.
         total = wp.vec4()
         weight = float(0.0)
         for q in range(1, wp.static(count)):
             beside = p + wp.static(wp.vec3i(*c[q]))
             k = index_of(n, wrapped(n, beside))
             if not crosses(n, bounded, beside) and solid[k] == wp.uint8(0) and fresh[k] != stamp:
-                g = vec()
-                for r in range(wp.static(count)):
-                    g[r] = load(f, r, k) * wp.static(STORAGES[storage][1])
-                drho, j, _diagonal, _off = moments(g)
+                drho, j, _diagonal, _off = moments_at(f, k)
                 inverse = 1.0 / (1.0 + drho)
                 total += wp.static(w[q]) * wp.vec4(drho, inverse * j[0], inverse * j[1], inverse * j[2])
                 weight += wp.static(w[q])
