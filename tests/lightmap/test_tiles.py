@@ -8,14 +8,13 @@ from builders.synthetic import random_sheet
 from wlm.errors import WlmError
 from wlm.lightmap.data import SheetFrames
 from wlm.lightmap.decode import SheetDecoder
+from wlm.lightmap.fit import SheetFit
+from wlm.lightmap.profile import Profile
 from wlm.lightmap.tiles import (
     TILE,
-    TileData,
     TileGrid,
     TileKind,
-    channel_means,
     classify,
-    cut,
     place,
     split,
 )
@@ -37,15 +36,10 @@ def lightmaps() -> SheetFrames:
     return from_arrays(frames, [0, 1, 2], mask)
 
 
-def _tile(linear: np.ndarray, mask: np.ndarray | None = None) -> TileData:
-    """Makes one tile of linear colours that broadcast to [T, 128, 128, 3]."""
+def _kind(linear: np.ndarray) -> TileKind:
+    """The kind of a tile of linear colours that broadcast to [T, 128, 128, 3]."""
     colour = np.broadcast_to(linear, (len(linear), TILE, TILE, 3)).astype(np.float32) ** np.float32(1 / GAMMA)
-    mask = np.ones((TILE, TILE), bool) if mask is None else mask
-    return TileData(index=np.array([0]), colour=colour[None], mask=mask[None])
-
-
-def _kind(linear: np.ndarray, mask: np.ndarray | None = None) -> TileKind:
-    return TileKind(classify(_tile(linear, mask), GAMMA)[0])
+    return classify(colour.reshape(len(linear), -1, 3), GAMMA)
 
 
 def test_grid():
@@ -104,29 +98,10 @@ def test_map_end_is_edge_padded_and_not_valid(lightmaps):
     assert (inside > 0).all()
 
 
-def test_a_tile_of_its_own_size(lightmaps):
-    last = TileGrid.of(*lightmaps.mask.shape).count - 1
-    own = cut(lightmaps, np.array([last])).encoded(2.2, padded=False)
-    (rows, columns), padded = own.mask.shape[1:], split(lightmaps, 2.2, [last])
-    np.testing.assert_allclose(own.colour, padded.colour[:, :, :rows, :columns], rtol=1e-6)
-    np.testing.assert_array_equal(own.mask, padded.mask[:, :rows, :columns])
-    assert own.mask.size < padded.mask.size
-
-
 def test_split_refuses(lightmaps):
     for tiles, text in (([6], "outside the grid"), ([-1], "outside the grid"), ([1, 1], "twice"), ([], "none")):
         with pytest.raises(WlmError, match=text):
             split(lightmaps, GAMMA, tiles)
-
-
-def test_channel_means_count_valid_texels_only(lightmaps):
-    tiles = split(lightmaps, 1.0)
-    means = channel_means(tiles.colour, tiles.mask)
-    assert means.shape == (6, 3, 3) and means.dtype == np.float64
-    valid = lightmaps.mask[TILE:, :TILE]
-    expected = lightmaps.frames[:, TILE:, :TILE][:, valid].astype(np.float64).mean(axis=1)
-    np.testing.assert_allclose(means[3], expected, rtol=1e-12)
-    np.testing.assert_array_equal(means[1], 0.0)
 
 
 @pytest.mark.parametrize("value", [1e-6, 6e-5, 0.01, 0.3, 1.0, 1.999, 900.0, 60_000.0])
@@ -144,12 +119,14 @@ def test_constant_is_one_half_float_step_and_no_more(value):
 
 
 def test_only_valid_texels_count():
-    linear = np.full((2, TILE, TILE, 3), 0.5, np.float32)
-    mask = np.ones((TILE, TILE), bool)
+    linear, mask = np.full((2, TILE, TILE, 3), 0.5, np.float32), np.ones((TILE, TILE), bool)
     mask[7] = False
     linear[0, 7] = 4.0
-    assert _kind(linear, mask) is TileKind.CONSTANT
-    assert _kind(linear) is TileKind.DYNAMIC
+    kinds = [
+        SheetFit(from_arrays(linear, [0, 1], valid), Profile(name="", frames="never")).kinds[0]
+        for valid in (mask, None)
+    ]
+    assert kinds == [TileKind.CONSTANT, TileKind.DYNAMIC]
 
 
 PATTERN = np.random.default_rng(4).uniform(0.25, 1.0, (1, TILE, TILE, 3))

@@ -39,7 +39,7 @@ from wlm.formats.limits import TIMES
 from wlm.formats.mask import read_mask
 from wlm.formats.scratch import room
 from wlm.lightmap.assumptions import set_lines, size_line
-from wlm.lightmap.groups import groups_of, times_of
+from wlm.lightmap.groups import Sheets, groups_of
 from wlm.lightmap.layout import odd_layout
 from wlm.lightmap.listing import Listing, list_set
 from wlm.lightmap.profile import TimeAxis
@@ -51,7 +51,6 @@ from wlm.lightmap.sheet import (
     VALUE_RANGES,
     Sheet,
     check_sheets,
-    first_light,
     is_group,
     is_name,
     sheets_of,
@@ -124,7 +123,7 @@ class SheetFrames:
 
 
 @dataclass(frozen=True, eq=False)
-class LightmapSet:
+class LightmapSet(Sheets[SheetFrames]):
     """Lightmaps over time: one or more sheets, each up to three channels of a layer of an atlas.
 
     The sheets of a light group (`wlm.lightmap.groups`) have the same times.
@@ -137,11 +136,6 @@ class LightmapSet:
     name: str
     sheets: dict[Sheet, SheetFrames]
 
-    @property
-    def light(self) -> SheetFrames:
-        """The lightmaps of the first sheet of radiance, or of the first sheet if no sheet is radiance."""
-        return self.sheets[first_light(self.sheets)]
-
     def find(self, sheet: Sheet) -> SheetFrames:
         """Returns the lightmaps of `sheet`. If the set has only one sheet, it returns the lightmaps of that sheet
         instead.
@@ -153,21 +147,6 @@ class LightmapSet:
             found = ", ".join(one.label for one in self.sheets)
             raise WlmError(f"{self.name}: expected a set with the sheet {sheet.label}, found {found}")
         return self.sheets.get(sheet, self.light)
-
-    @property
-    def groups(self) -> tuple[str, ...]:
-        """Names of the light groups, one for a set without groups."""
-        return groups_of(self.sheets)
-
-    @property
-    def times(self) -> np.ndarray:
-        """The times of all groups, float64 [T], increasing; see `wlm.lightmap.groups.times_of`."""
-        return times_of(self.sheets)
-
-    @property
-    def period(self) -> float | None:
-        """Length of the day in the unit of the times; None if the set is not periodic."""
-        return self.light.period
 
     @property
     def source(self) -> str:

@@ -18,7 +18,7 @@ from wlm.lightmap.encodings.maps import check_packable
 from wlm.lightmap.evaluation import lost_light
 from wlm.lightmap.model import LightmapModel, SheetModel, decode_scale, encode_scale, part_table
 from wlm.lightmap.profile import Profile
-from wlm.lightmap.tiles import TILE, TileGrid, TileKind, channel_means, check_index, classify, cut, split
+from wlm.lightmap.tiles import TILE, TileGrid, TileKind, check_index, classify, cut, split
 from wlm.lightmap.trainer import Fitter, TileJob
 from wlm.system import Meter, OnProgress
 from wlm.workers import cores, each
@@ -273,17 +273,17 @@ def _classify(
     """Classifies tiles and computes the numbers that normalise each (section 4); for the settings see `Profile`."""
 
     def look(number: int) -> _Facts:
-        tile = cut(lightmaps, np.array([number])).encoded(gamma, padded=False)
-        kind = TileKind(int(classify(tile, gamma, peak)[0]))
+        tile = cut(lightmaps, np.array([number]))
+        colour = np.power(tile.light[0][:, tile.mask[0]], np.float32(1.0 / gamma))  # [T, K, 3], the valid texels
+        kind = classify(colour, gamma, peak)
         if kind == TileKind.EMPTY:
             return _Facts(kind)
-        colour = tile.colour[0][:, tile.mask[0]]  # [T, K, 3], the valid texels
         if kind == TileKind.CONSTANT:
             radiance = colour.astype(np.float64) ** gamma
             # The middle of the range is at most half a step of half float off.
             middle = 0.5 * (radiance.min(1) + radiance.max(1)) if peak is None else radiance.mean(1)
             return _Facts(kind, constant=middle)
-        stored = encode_scale(channel_means(tile.colour, tile.mask)[0], gamma)
+        stored = encode_scale(colour.mean(1, dtype=np.float64), gamma)
         scale = decode_scale(stored, gamma)
         lit = scale > 0
         values = colour * np.divide(1.0, scale, out=np.zeros_like(scale), where=lit)[:, None]

@@ -18,13 +18,13 @@ These are the rules:
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Protocol, TypeVar
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 
 from wlm.errors import WlmError
 from wlm.formats.exr import HALF_MAX
-from wlm.lightmap.sheet import Sheet
+from wlm.lightmap.sheet import Sheet, first_light
 
 MOST_WEIGHT = HALF_MAX
 """Largest weight of a group: 65,504."""
@@ -38,8 +38,10 @@ Weight = float | Sequence[float] | np.ndarray
 class Timed(Protocol):
     """A sheet of a set or a model: its stored times, float64 [T], and the length of the day or None."""
 
-    times: np.ndarray
-    period: float | None
+    @property
+    def times(self) -> np.ndarray: ...
+    @property
+    def period(self) -> float | None: ...
 
 
 def groups_of(sheets: Iterable[Sheet]) -> tuple[str, ...]:
@@ -60,6 +62,35 @@ def times_of(sheets: Mapping[Sheet, Timed]) -> np.ndarray:
     each = {sheet.group: own.times for sheet, own in sheets.items()}
     changing = [times for times in each.values() if len(times) > 1] or list(each.values())[:1]
     return changing[0] if len(changing) == 1 else np.unique(np.concatenate(changing))
+
+
+S = TypeVar("S", bound=Timed)
+
+
+class Sheets(Generic[S]):
+    """Base of a set and of a model of several sheets; `sheets` has them by name, group by group."""
+
+    sheets: dict[Sheet, S]
+
+    @property
+    def light(self) -> S:
+        """The first sheet of radiance, or the first sheet if no sheet is radiance."""
+        return self.sheets[first_light(self.sheets)]
+
+    @property
+    def groups(self) -> tuple[str, ...]:
+        """Names of the light groups, one if the set has no groups."""
+        return groups_of(self.sheets)
+
+    @property
+    def times(self) -> np.ndarray:
+        """float64 [T], the times of all groups, increasing; see `times_of`."""
+        return times_of(self.sheets)
+
+    @property
+    def period(self) -> float | None:
+        """Length of the day in the unit of the times; None if the set is not periodic."""
+        return self.light.period
 
 
 def changed_weights(

@@ -26,7 +26,7 @@ from wlm.errors import WlmError
 from wlm.formats.bc7 import BLOCK_BYTES
 from wlm.formats.exr import HALF_MAX
 from wlm.formats.parts import Part
-from wlm.lightmap.groups import groups_of, in_groups, times_of
+from wlm.lightmap.groups import Sheets, in_groups
 from wlm.lightmap.profile import Profile, TimeAxis
 from wlm.lightmap.sheet import Sheet, first_light, layer_sheets
 from wlm.lightmap.tiles import TILE, TileGrid, TileKind
@@ -262,7 +262,7 @@ class SheetModel:
 
 
 @dataclass(eq=False)
-class LightmapModel(Model):
+class LightmapModel(Sheets[SheetModel], Model):
     """A compressed lightmap set: a `SheetModel` for each sheet (up to three channels of a layer).
 
     A model from `wlm.load` keeps its file open and reads tiles when they are needed; a tile whose bytes do not match
@@ -285,26 +285,6 @@ class LightmapModel(Model):
     profile: Profile
     sheets: dict[Sheet, SheetModel]
     warnings: tuple[str, ...] = ()
-
-    @property
-    def light(self) -> SheetModel:
-        """The model of the first sheet of radiance, or of the first sheet if no sheet is radiance."""
-        return self.sheets[first_light(self.sheets)]
-
-    @property
-    def groups(self) -> tuple[str, ...]:
-        """Names of the light groups, one for a model of a set without groups."""
-        return groups_of(self.sheets)
-
-    @property
-    def times(self) -> np.ndarray:
-        """float64 [T], the stored times of all groups, increasing; see `wlm.lightmap.groups.times_of`."""
-        return times_of(self.sheets)
-
-    @property
-    def period(self) -> float | None:
-        """Length of the day in the unit of the times; None if the set is not periodic."""
-        return self.light.period
 
     @property
     def memory_bytes(self) -> int:

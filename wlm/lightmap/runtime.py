@@ -17,7 +17,7 @@ from wlm.formats.shared_exponent import unpack_rgb9e5
 from wlm.lightmap.decode import device_of, gelu_of
 from wlm.lightmap.encodings.base import inverse_of, rgba
 from wlm.lightmap.encodings.frames import FrameTiles
-from wlm.lightmap.encodings.maps import MapTiles
+from wlm.lightmap.encodings.maps import MapTiles, split_networks
 from wlm.lightmap.model import SheetModel
 from wlm.lightmap.tiles import TILE
 from wlm_kernels.lightmap import decode as decode_kernels
@@ -110,18 +110,13 @@ class MatrixDecoder(_MapDecoder):
             raise WlmError(f"model: expected networks whose hidden width is a multiple of 16, got {profile.hidden}")
         super().__init__(model, name, "fast", shared)
         self._kernels = matrix_decode.matrix_kernels(profile.hidden, profile.uvt_resolution, shared)
-        _, hidden, output_layers = self._tiles.arguments
-        n = len(self.numbers)
-        packed = matrix_decode.pack_networks(
-            hidden.numpy().reshape(n, -1, profile.hidden), output_layers.numpy().reshape(n, -1, 3)
-        )
+        packed = matrix_decode.pack_networks(*split_networks(model.net.astype(np.float32), profile.hidden))
         self._packed = wp.array(packed, dtype=wp.uint32, device=self.device)
 
     def decode(self) -> None:
-        (stored, hidden, _), places = self._tiles.arguments, self._tiles.places
-        states = self._states[: len(self._reads)]
+        (stored, hidden, _), states = self._tiles.arguments, self._states[: len(self._reads)]
         share = self._reads[1][1] if len(states) == 2 else 0.0
-        self._kernels.decode(stored, self._packed, hidden, states, share, places, self._rows, self.out)
+        self._kernels.decode(stored, self._packed, hidden, states, share, self._rows, self.out)
 
 
 class ExactDecoder(_MapDecoder):

@@ -97,11 +97,9 @@ class TileCut:
     light: list[np.ndarray]
     mask: list[np.ndarray]
 
-    def encoded(self, gamma: float, padded: bool = True) -> TileData:
-        """Converts the tiles to gamma-space colours, padded to 128 x 128 texels, which take N * T * 192 KiB; a single
-        tile that isn't `padded` keeps its height and width."""
-        size = (TILE, TILE) if padded else self.mask[0].shape
-        colour = np.zeros((len(self.index), len(self.light[0]), *size, 3), np.float32)
+    def encoded(self, gamma: float) -> TileData:
+        """Converts the tiles to gamma-space colours, padded to 128 x 128 texels, which take N * T * 192 KiB."""
+        colour = np.zeros((len(self.index), len(self.light[0]), TILE, TILE, 3), np.float32)
 
         def encode(i: int) -> None:
             valid, out = self.mask[i], colour[i]
@@ -115,7 +113,7 @@ class TileCut:
                 np.power(out, np.float32(1.0 / gamma), out=out)
 
         list(each(encode, range(len(self.index))))
-        return TileData(self.index, colour, np.stack([_whole(valid) if padded else valid for valid in self.mask]))
+        return TileData(self.index, colour, np.stack(list(map(_whole, self.mask))))
 
 
 class TileKind(IntEnum):
@@ -151,48 +149,26 @@ def valid_texels(mask: np.ndarray, number: int) -> np.ndarray:
     return _whole(mask[TileGrid.of(*mask.shape).window(number)])
 
 
-def channel_means(colour: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Computes the mean of each channel of each tile at each time over the valid texels (section 4), float64 [N, T, 3],
-    0 for an empty tile; `colour` and `mask` are those of `TileData`."""
-    means = np.zeros((*colour.shape[:2], 3))
-    for n, valid in enumerate(mask):
-        if valid.any():
-            # [T, K, 3]: only the valid texels are summed, so texels in gaps have no weight.
-            means[n] = colour[n][:, valid].mean(axis=1, dtype=np.float64)
-    return means
+def classify(colour: np.ndarray, gamma: float, peak: float | None = None) -> TileKind:
+    """Finds the kind of a tile that is not stored as frames: `EMPTY`, `CONSTANT` or `DYNAMIC`.
 
-
-def classify(tiles: TileData, gamma: float, peak: float | None = None) -> np.ndarray:
-    """Finds the kind of each tile: `EMPTY`, `CONSTANT` or `DYNAMIC`.
-
-    A tile's valid texels are compared in linear space:
-
-    - `EMPTY`: the tile has no valid texel.
-    - `CONSTANT`: at every time, the greatest value of each channel is at most one step of half float above the least.
-    - `DYNAMIC`: all other tiles.
-
-    For values that are not light, whose range is `peak`, a tile is also constant if, at every time, its channel means
-    have a PSNR of `_FLAT_DB` and no texel is off by more than `_OUTLIER` times the RMS error at that PSNR: 8-bit
-    sources are never exactly flat.
+    A tile is constant if, at every time, the greatest value of each channel is at most one step of half float above the
+    least, in linear space. For values that are not light, whose range is `peak`, it also is if, at every time, its
+    channel means have a PSNR of `_FLAT_DB` and no texel is off by more than `_OUTLIER` times the RMS error at that
+    PSNR: 8-bit sources are never exactly flat.
 
     Args:
-        tiles: From `split`.
-        gamma: The gamma given to `split`.
+        colour: float32 [T, K, 3], the K valid texels at each time, in gamma space.
+        gamma: Exponent that makes them linear.
         peak: See `wlm.lightmap.profile.Profile.peak`.
-
-    Returns:
-        The `TileKind` of each tile, `[N]` int64.
     """
-    kinds = np.empty(len(tiles.index), np.int64)
-    for n, valid in enumerate(tiles.mask):
-        colour = tiles.colour[n]
-        if not valid.any():
-            kinds[n] = TileKind.EMPTY
-        elif _is_constant(colour, valid, gamma) or (peak and _is_flat(colour, valid, gamma, peak)):
-            kinds[n] = TileKind.CONSTANT
-        else:
-            kinds[n] = TileKind.DYNAMIC
-    return kinds
+    if not colour.size:
+        return TileKind.EMPTY
+    encoded = colour.astype(np.float64)
+    # Decoding is monotonic, so the extremes are taken before it.
+    low, high = encoded.min(axis=1) ** gamma, encoded.max(axis=1) ** gamma
+    constant = (high - low <= _STEP_SLACK * _half_step(low)).all() or (peak and _is_flat(encoded**gamma, peak))
+    return TileKind.CONSTANT if constant else TileKind.DYNAMIC
 
 
 def check_index(index: np.ndarray, grid: TileGrid) -> None:
@@ -228,15 +204,7 @@ def _half_step(value: np.ndarray) -> np.ndarray:
     return np.ldexp(1.0, exponent - _HALF_MANTISSA_BITS)
 
 
-def _is_constant(colour: np.ndarray, valid: np.ndarray, gamma: float) -> bool:
-    encoded = colour[:, valid].astype(np.float64)  # [T, K, 3]
-    # Decoding is monotonic, so the extremes are taken before it.
-    low, high = encoded.min(axis=1) ** gamma, encoded.max(axis=1) ** gamma
-    return bool((high - low <= _STEP_SLACK * _half_step(low)).all())
-
-
-def _is_flat(colour: np.ndarray, valid: np.ndarray, gamma: float, peak: float) -> bool:
-    linear = colour[:, valid].astype(np.float64) ** gamma
+def _is_flat(linear: np.ndarray, peak: float) -> bool:
     error = np.abs(linear - linear.mean(axis=1, keepdims=True))
     allowed = peak * 10.0 ** (-_FLAT_DB / 20.0)
     return bool((np.square(error).mean((1, 2)) <= allowed**2).all() and error.max() <= _OUTLIER * allowed)

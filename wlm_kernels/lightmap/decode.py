@@ -192,8 +192,8 @@ def exact_kernels(hidden: int, gelu: str) -> tuple[Any, Any, Any]:
     Returns:
         Kernels that write, in this order, linear radiance as vec3; gamma-space colour as uint32, 8-bit RGBA from the
         lowest byte; and linear radiance as uint32, RGB9E5. Their inputs are `Stored`; hidden layers, vecH
-        [N, 18 + H]; output layers, vec3 [N, H + 1]; `TimeState`; int [N], the index of each tile in
-        `TimeState`; and int [n], the tiles to decode. Their output is [n, 128, 128].
+        [N, 18 + H]; output layers, vec3 [N, H + 1]; `TimeState`; and int [n], the tiles to
+        decode. Their output is [n, 128, 128].
     """
     vec_hidden, network_output = wp.types.vector(hidden, float), texel_network(hidden, gelu)
 
@@ -205,7 +205,6 @@ def exact_kernels(hidden: int, gelu: str) -> tuple[Any, Any, Any]:
             hidden: wp.array2d[vec_hidden],
             output: wp.array2d[wp.vec3],
             time: TimeState,
-            places: wp.array1d[int],
             tiles: wp.array1d[int],
             # out:
             out: wp.array3d[dtype],
@@ -213,7 +212,7 @@ def exact_kernels(hidden: int, gelu: str) -> tuple[Any, Any, Any]:
             i, y, x = wp.tid()
             n = tiles[i]
             texel = network_output(stored, hidden, output, time.tau, time.encoding, n, y, x)
-            out[i, y, x] = finish(time, places[n], texel)
+            out[i, y, x] = finish(time, n, texel)
 
         return decode
 

@@ -118,7 +118,6 @@ class MatrixKernels:
         hidden: wp.array,
         times: list[TimeState],
         share: float,
-        places: wp.array,
         tiles: wp.array,
         out: wp.array,
     ) -> None:
@@ -130,7 +129,6 @@ class MatrixKernels:
             hidden: vecH [N, 18 + H], hidden layers.
             times: One time, or two between which radiance is interpolated linearly (neural-dynamic-gi, eq. 2).
             share: Weight of the second time, 0 to 1; 0 for one time.
-            places: int [N], index of each tile in `times`.
             tiles: int [n], the tiles to decode.
             out: uint32 [n, 128, 128], written: colour as 8-bit RGBA from the lowest byte, relative to the larger bound
                 of the times; or radiance as RGB9E5.
@@ -138,7 +136,7 @@ class MatrixKernels:
         wp.launch(
             self._one if len(times) == 1 else self._two,
             (out.shape[0], 128 // self._rows[len(times) - 1], 128),
-            inputs=[stored, packed, hidden, times[0], times[-1], share, places, tiles],
+            inputs=[stored, packed, hidden, times[0], times[-1], share, tiles],
             outputs=[out],
             device=out.device,
             block_dim=128,
@@ -234,20 +232,18 @@ def _decode_kernel(width: int, resolution: int, shared: bool, hours: int, rows: 
         early: TimeState,
         late: TimeState,
         share: float,
-        places: wp.array1d[int],
         tiles: wp.array1d[int],
         # out:
         out: wp.array3d[wp.uint32],
     ):
         i, strip, x = wp.tid()
         n = tiles[i]
-        place = places[n]
         # Of a warp's 32 columns, a thread gets the result of another one than it brought.
         lane = x % 32
         column = x - lane + 8 * (lane % 4) + lane // 4
-        shift, spread = early.shift[place], early.spread[place]
-        early_scale, late_scale = early.scale[place], late.scale[place]
-        inverse = bound_of(wp.max(bound_of(early.inverse_peak[place]), bound_of(late.inverse_peak[place])))
+        shift, spread = early.shift[n], early.spread[n]
+        early_scale, late_scale = early.scale[n], late.scale[n]
+        inverse = bound_of(wp.max(bound_of(early.inverse_peak[n]), bound_of(late.inverse_peak[n])))
         # Variables keep the loops rolled.
         parts = int(wp.static(rows // 4))
         count = int(wp.static(hours))

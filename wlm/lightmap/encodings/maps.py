@@ -109,11 +109,8 @@ def split_networks(nets: np.ndarray, hidden: int) -> tuple[np.ndarray, np.ndarra
 
 
 class MapTiles(DeviceTiles):
-    """The dynamic tiles of a sheet on a device.
-
-    `places`, int [n] on the device, 0 to n - 1, are indices of the tiles in the arrays of a `TimeState`; `arguments`
-    are the first arguments of each decode kernel: `Stored` and the networks, see `wlm_kernels.mlp`.
-    """
+    """The dynamic tiles of a sheet on a device; `arguments` are the first arguments of each decode kernel: `Stored` and
+    the networks, see `wlm_kernels.mlp`."""
 
     def __init__(self, sheet: SheetModel, device: str, gelu: str) -> None:
         """Uploads the dynamic tiles of a sheet."""
@@ -126,7 +123,6 @@ class MapTiles(DeviceTiles):
         self._peak = decode_scale(sheet.peak, profile.gamma)
         affine = np.ascontiguousarray(sheet.affine.astype(np.float32).swapaxes(0, 1))
         self._shift, self._spread = (wp.array(values, dtype=wp.vec3, device=device) for values in affine)
-        self.places = wp.array(np.arange(len(self.numbers), dtype=np.int32), dtype=int, device=device)
         self._kernels = decode_kernels.exact_kernels(profile.hidden, gelu)
 
         def blocks(values: np.ndarray) -> wp.array:
@@ -173,8 +169,9 @@ class MapTiles(DeviceTiles):
         `form` is the output written to `out`, [k, 128, 128]: 0 for radiance (vec3), 1 for 8-bit RGBA (uint32), 2 for
         RGB9E5 (uint32).
         """
-        inputs = [*self.arguments, state, self.places, rows]
-        wp.launch(self._kernels[form], out.shape, inputs=inputs, outputs=[out], device=self._device)
+        wp.launch(
+            self._kernels[form], out.shape, inputs=[*self.arguments, state, rows], outputs=[out], device=self._device
+        )
 
     def _decoded(self, rows: np.ndarray, time: float, form: int) -> wp.array:
         dtype = wp.uint32 if form else wp.vec3
