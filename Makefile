@@ -20,10 +20,12 @@ demo: $(STAMP)
 demo-network: $(STAMP)
 	$(BIN)/python demos/smoke_network.py --train
 
-# Makes the pictures of README and docs from the output of the demos and of the tutorials; WLM_THREE names three.js.
+# Makes the pictures of README and docs from the output of the demos and of the tutorials, and the plots from the
+# committed results; WLM_THREE names three.js.
 pictures: demo
 	$(BIN)/python demos/tutorials.py
-	$(BIN)/python demos/pictures.py
+	$(BIN)/python -m demos.pictures
+	$(BIN)/python -m benchmarks plots
 
 # Python keeps the compiled form of modules and tests, even where the environment turns that off: each of the many
 # commands that the tests start would otherwise compile the whole package again.

@@ -286,6 +286,14 @@ def plot(
 
 
 @app.command()
+def plots() -> None:
+    """Draw the plots of the documents from the committed result files, into `docs/images`."""
+    from benchmarks.plots import draw_all
+
+    show_text("\n".join(draw_all()))
+
+
+@app.command()
 def compare(
     new: Annotated[Path, typer.Argument(metavar="NEW.json", help="Result file of the changed code.")],
     old: Annotated[Path, typer.Argument(metavar="OLD.json", help="Result file from before the change.")],

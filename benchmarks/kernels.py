@@ -143,6 +143,7 @@ def draw(rows: Sequence[Row], path: Path) -> None:
     """Draws time over size of each case, with its floor, and writes the picture."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
+    from matplotlib.ticker import LogLocator, NullFormatter
 
     cases = list(dict.fromkeys(row.method for row in rows if row.get("of_floor") is not None))
     columns = min(4, max(len(cases), 1))
@@ -155,13 +156,23 @@ def draw(rows: Sequence[Row], path: Path) -> None:
         axes.loglog(sizes, [row["time_ms"] for row in found], "o-", color="#0072B2", label="time")
         axes.loglog(sizes, [row["floor_ms"] for row in found], "--", color="#D55E00", label="floor")
         axes.set_title(name, fontsize=10)
-        axes.set_xlabel(CASES[name].unit if name in CASES else "size", fontsize=8)
-        axes.set_ylabel("ms", fontsize=8)
-        axes.tick_params(labelsize=7)
+        axes.set_xlabel(CASES[name].unit if name in CASES else "size", fontsize=9)
+        axes.set_ylabel("ms", fontsize=9)
+        for axis in (axes.xaxis, axes.yaxis):
+            axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if _narrow(axis.get_view_interval()) else (1.0,)))
+            axis.set_major_formatter(lambda value, _: f"{value:g}" if value < 1e4 else f"{value:.0e}".replace("+0", ""))
+            axis.set_minor_formatter(NullFormatter())
+        axes.tick_params(labelsize=9)
         axes.grid(True, color="#e4e4e4", linewidth=0.7)
-        axes.legend(fontsize=7)
+        if number == 0:
+            axes.legend(fontsize=9)
     with atomic_path(path) as part:
         figure.savefig(part, format="png")
+
+
+def _narrow(limits: Sequence[float]) -> bool:
+    """Says whether an axis has too few powers of ten for its labels."""
+    return limits[1] < 100.0 * limits[0]
 
 
 __all__ = ["CASES", "Work", "draw", "run"]

@@ -22,10 +22,10 @@ if TYPE_CHECKING:
 
 # Okabe and Ito 2008, "Color Universal Design": told apart with any common colour vision. Its yellow is too
 # pale for white.
-_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 # A second sign for the method, so that a plot survives grey printing; their number shares no factor with the
 # colours'.
-_MARKERS = ("o", "s", "^", "D", "v", "P")
+MARKERS = ("o", "s", "^", "D", "v", "P")
 # Above this ratio of largest to smallest, a linear axis squeezes the small ones together.
 _LOG_RATIO = 8.0
 _MARKER_POINTS = 7.0
@@ -134,7 +134,7 @@ def plot(rows: Sequence[Row], path: str | Path, x: str | Panel | Sequence[str | 
 
 def _style(method: str, methods: Sequence[str]) -> tuple[str, str]:
     index = methods.index(method)
-    return _COLOURS[index % len(_COLOURS)], _MARKERS[index % len(_MARKERS)]
+    return COLOURS[index % len(COLOURS)], MARKERS[index % len(MARKERS)]
 
 
 def _ink(colour: str) -> tuple[float, ...]:

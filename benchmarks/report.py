@@ -95,7 +95,7 @@ def pages(paths: Sequence[str | os.PathLike[str]], index: str | os.PathLike[str]
         page = f"{index.stem}/{system}.md"
         contents[page] = "\n".join([f"# Results: {system}\n", f"{head}\n", *plots, rest, *parts, *runs_shown])
         links.append(f"- [{system}]({page})")
-    foot = "Each page has the commands that measure its rows again; `python -m benchmarks plot` draws the plots.\n"
+    foot = "Each page has the commands that measure its rows again; `python -m benchmarks plots` draws the plots.\n"
     return {index.name: "\n".join(["# Results\n", f"{head}\n", *links, "", foot]), **contents}
 
 

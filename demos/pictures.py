@@ -1,9 +1,11 @@
 """The pictures of README and docs: the street, what `wlm view` and `wlm web` show of the demos' files, and what the
 tutorials leave, with their pages of three.js.
 
-    make pictures
+    make pictures                           # all, after the demos and the tutorials
+    python -m demos.pictures web.png        # some, of what the demos have left
 
-It needs a Chromium and playwright, for `wlm view` pyvista, and for the tutorials' pages three.js: WLM_THREE names the
+`sources.json` beside the pictures gets a digest of the inputs and scripts of each (`SOURCES`), which a test compares.
+It needs a Chromium and playwright, for `wlm view` pyvista, and for pages of tutorials three.js: WLM_THREE names the
 folder of an unpacked `three` from npm, 0.187 or later.
 """
 
@@ -25,6 +27,8 @@ from typing import Any
 from PIL import Image, ImageDraw, ImageFont
 
 import wlm
+from benchmarks.plots import digest, stamp
+from demos.tutorials import steps
 from wlm.cli.console import quiet_warp
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_path
@@ -75,6 +79,37 @@ DEMOS = {
     "smoke-light.png": "smoke/smoke_light.png",
 }
 
+# By file: the scripts and data that it is made from, below `demos`.
+SOURCES = {
+    "street.png": ("data/street/**/*",),
+    "web.png": ("lightmap.py", "atlas.py", "data/city/*", "data/atlas/*", "../wlm/export/page/assets/page.css"),
+    "lightmap.png": ("lightmap.py", "data/city/*"),
+    "atlas.png": ("atlas.py", "data/atlas/*"),
+    "probe.png": ("probe.py", "data/probes/*"),
+    "fluid-control.png": ("fluid_control.py",),
+    "ops-bc7.png": ("ops_bc7.py", "data/atlas/*"),
+    "ops-march.png": ("ops_march.py", "data/smoke/*"),
+    "ops-silhouette.png": ("ops_silhouette.py",),
+    "smoke.png": ("smoke.py", "plume.py"),
+    "smoke-light.png": ("smoke_light.py", "plume.py"),
+    "tutorial-bake.png": ("data/cornell/*",),
+    "tutorial-optimise.png": (),
+    "tutorial-probes.png": ("data/cornell/*",),
+    "tutorial-scene.png": ("data/cornell/*", "data/street/car.glb"),
+    "tutorial-smoke.png": (),
+}
+
+
+def digests() -> dict[str, str]:
+    """Returns the digest of each picture's sources; a tutorial's commands and code are such, its words are not."""
+    found = {}
+    for name, patterns in SOURCES.items():
+        paths = sorted({path for pattern in patterns for path in HERE.glob(pattern) if path.suffix not in ("", ".md")})
+        tutorial = HERE.parent / "docs" / "tutorials" / f"{Path(name).stem.removeprefix('tutorial-')}.md"
+        code = repr(list(steps(tutorial))) if name.startswith("tutorial-") else ""
+        found[name] = digest(code.encode() + b"".join(path.read_bytes() for path in paths))
+    return found
+
 
 class Browser:
     """Chromium that takes pictures of pages."""
@@ -84,7 +119,7 @@ class Browser:
 
     def open(self, name: str, width: int, height: int, **options: Any) -> Any:
         """Opens a page of `gallery.py` or a report; a size in pixels."""
-        page = self.chromium.new_page(viewport={"width": width, "height": height}, **options)
+        page = self.chromium.new_page(viewport={"width": width, "height": height}, color_scheme="dark", **options)
         page.goto((self.folder / f"{name}.html").as_uri())
         return page
 
@@ -228,28 +263,38 @@ def save(path: Path, picture: Image.Image) -> None:
     print(f"{path.name}: {picture.width} x {picture.height} pixels, {path.stat().st_size:,} bytes")
 
 
+def pictures(demos: Path, wanted: Sequence[str]) -> Iterator[tuple[str, Image.Image]]:
+    """Yields the wanted pictures by the names of their files."""
+    if "street.png" in wanted:
+        yield "street.png", street()
+    for kind, options in ((["web.png", *PAGES], SOFTWARE_GL), (WEBGPU_PAGES, SOFTWARE_GPU)):
+        if names := [name for name in kind if name in wanted]:
+            with browser(demos, options) as pages:
+                for name in names:
+                    yield name, page_and_phone(pages) if name == "web.png" else tutorial_page(pages, name)
+    for name in wanted:
+        if name in TUTORIALS:
+            yield name, tutorial_row(demos, name)
+        elif name in VIEWS:
+            yield name, window(demos, name)
+        elif name in DEMOS:
+            yield name, Image.open(demos / DEMOS[name]).convert("RGB")
+
+
 def main() -> None:
     """Reads the command line and writes the pictures."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("names", nargs="*", metavar="NAME.png", help="pictures to make; default: all")
     parser.add_argument("--demos", type=Path, default=HERE / "out", help="the folder of the demos' files")
     parser.add_argument("--out", type=Path, default=HERE.parent / "docs" / "images", help="the folder to write to")
     args = parser.parse_args()
     quiet_warp()
+    if unknown := sorted(set(args.names) - SOURCES.keys()):
+        sys.exit(f"error: {unknown[0]}: expected some of {', '.join(SOURCES)}")
     try:
-        save(args.out / "street.png", street())
-        with browser(args.demos) as pages:
-            save(args.out / "web.png", page_and_phone(pages))
-            for name in PAGES:
-                save(args.out / name, tutorial_page(pages, name))
-        with browser(args.demos, SOFTWARE_GPU) as pages:
-            for name in WEBGPU_PAGES:
-                save(args.out / name, tutorial_page(pages, name))
-        for name in TUTORIALS:
-            save(args.out / name, tutorial_row(args.demos, name))
-        for name in VIEWS:
-            save(args.out / name, window(args.demos, name))
-        for name, made in DEMOS.items():
-            save(args.out / name, Image.open(args.demos / made).convert("RGB"))
+        for name, picture in pictures(args.demos, args.names or list(SOURCES)):
+            save(args.out / name, picture)
+            stamp(args.out, {name: digests()[name]})
     except (OSError, WlmError) as error:
         sys.exit(f"error: {error}; expected what the other demos leave")
 

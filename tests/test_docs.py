@@ -23,11 +23,14 @@ from pathlib import Path
 import pytest
 
 from benchmarks import FIGURES, pages, read_json
+from benchmarks.plots import digests as digests_of_plots
+from demos.pictures import digests as digests_of_pictures
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 DOCUMENTS = [ROOT / "README.md", *sorted([*DOCS.glob("*.md"), *DOCS.glob("notes/*.md"), *DOCS.glob("tutorials/*.md")])]
 RESULTS = sorted((DOCS / "results").glob("*.md"))
+BY_HAND = {"atlas-mips.png", "bake.png", "fire.png", "smoke-fan.png", "smoke-rabbit.png"}  # pictures without a script
 STATED = json.loads((DOCS / "figures.json").read_text(encoding="utf-8"))
 
 
@@ -110,9 +113,20 @@ def test_pages_of_results_are_those_that_the_command_makes(monkeypatch):
 def test_every_picture_is_shown_and_small():
     texts = [page.read_text(encoding="utf-8") for page in DOCUMENTS + RESULTS]
     shown = {name for text in texts for name in re.findall(r"images/([\w.-]+)\)", text)}
-    pictures = {path.name: path.stat().st_size for path in (DOCS / "images").iterdir()}
+    pictures = {path.name: path.stat().st_size for path in (DOCS / "images").glob("*.png")}
     assert pictures.keys() == shown
     assert max(pictures.values()) <= 400_000
+
+
+def test_pictures_are_made_from_the_present_sources():
+    stored = json.loads((DOCS / "images" / "sources.json").read_text(encoding="utf-8"))
+    expected = {}
+    for command, digests in (("benchmarks plots", digests_of_plots()), ("demos.pictures", digests_of_pictures())):
+        stale = [name for name, digest in digests.items() if stored.get(name) != digest]
+        assert not stale, f"{stale}: sources changed: run their demos and `python -m {command}`, and look at them"
+        expected |= digests
+    assert stored == expected
+    assert BY_HAND | stored.keys() == {path.name for path in (DOCS / "images").glob("*.png")}
 
 
 def test_pages_are_short():

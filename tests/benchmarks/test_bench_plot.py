@@ -1,5 +1,6 @@
 """The Pareto front by hand, and plots that are drawn, complete and readable."""
 
+import json
 import math
 from dataclasses import replace
 from xml.etree import ElementTree
@@ -7,6 +8,8 @@ from xml.etree import ElementTree
 import pytest
 
 from benchmarks import Row, pareto_front, plot
+from benchmarks.plots import Curve, digests, draw_all
+from wlm.errors import WlmError
 
 NAN = math.nan
 ROWS = [
@@ -67,3 +70,12 @@ def test_panels_name_the_rows_that_have_their_values(tmp_path, as_text):
     assert texts.count("half slow") == texts.count("not measured") == 1
     assert texts.count("Pareto front") >= 2
     assert [p.name for p in tmp_path.iterdir()] == ["p.svg"]
+
+
+def test_plots_of_the_documents(tmp_path):
+    """Every plot is drawn with the digest of its points, digests of other pictures stay, and a curve has points."""
+    (tmp_path / "sources.json").write_text('{"other.png": "0"}', encoding="utf-8")
+    assert set(draw_all(tmp_path)) == digests().keys() == {path.name for path in tmp_path.glob("*.png")}
+    assert json.loads((tmp_path / "sources.json").read_text()) == digests() | {"other.png": "0"}
+    with pytest.raises(WlmError, match=r"cpu\.json: expected rows of city that match NTC"):
+        Curve("cpu", "lightmap", "city", "NTC .*").rows()
