@@ -3,6 +3,7 @@
 import functools
 import os
 import shutil
+import sys
 from functools import partial
 
 import numpy as np
@@ -122,7 +123,8 @@ def test_a_killed_actor_of_a_cluster_changes_nothing(job, tmp_path, monkeypatch,
 @pytest.fixture(scope="module")
 def cluster():
     ray = pytest.importorskip("ray")
-    ray.init(num_cpus=4, include_dashboard=False, log_to_driver=False)
+    paths = {"env_vars": {"PYTHONPATH": os.pathsep.join(sys.path)}}  # of the tests' own classes
+    ray.init(num_cpus=4, include_dashboard=False, log_to_driver=False, runtime_env=paths)
     yield ray
     ray.shutdown()
 

@@ -229,10 +229,10 @@ class _Dispatch:
             self._dead.remove(number)
         run.step, run.saving = None, False
         self._running[number] = run
-        kept = self._checkpoint
+        job, kept = run.task.job(), self._checkpoint
         states = [None if kept is None else kept.running(each) for each in run.task.numbers]
         try:
-            self._workers.call(number, "start", run.task.job(), states)
+            self._workers.call(number, "start", job, states)
         except (TypeError, AttributeError, pickle.PicklingError) as error:
             told = f"{self._meter.stage}: task {run.task.numbers[0]} cannot be sent to a worker: {one_line(error)}"
             raise WlmError(told) from error

@@ -257,6 +257,16 @@ def test_a_sequence_in_kelvin(tmp_path: Path):
     assert float(load_frames(tmp_path, up="y", kelvin=False).load(1).temperature.max()) == 200
 
 
+def test_kelvin_without_a_temperature(tmp_path: Path):
+    for name in ("s_1.vdb", "s_2.vdb"):
+        (tmp_path / name).write_bytes(vdb_file({"density": grid(smoke())}))
+    with pytest.raises(WlmError, match="kelvin: expected temperatures, whose unit it is, found none"):
+        load_frames(tmp_path, up="y", kelvin=True)
+    with pytest.raises(WlmError, match=r"s_1\.vdb: kelvin: expected temperatures"):
+        load_frames(tmp_path / "s_1.vdb", up="y", kelvin=True).load(1)
+    assert load_frames(tmp_path, up="y", kelvin=False).load(2).temperature is None
+
+
 def test_one_grid_for_a_sequence(tmp_path: Path):
     """Before the smoke begins, a file may have other grids only; none of them stands in for it."""
     write(tmp_path / "s_0001.vdb", "flame")

@@ -239,6 +239,7 @@ def test_scaling_keeps_one_cell(tmp_path):
         ({"grid": GRID | {"faces": dict.fromkeys(FACES, "wall")}}, "expected an open face"),
         ({"grid": GRID | {"faces": dict.fromkeys(("-y", "+y"), "periodic")}}, "inlets on faces that aren't periodic"),
         ({"air": {"wind": {"keys": [[0, 1, 0]]}}}, "air.wind.keys"),
+        ({"air": {"wind": {"keys": [[0, 1e300, 0, 0]]}}}, "of numbers up to 1e+18"),
         ({"air": {"wind": {"keys": [[0, 1, 0, 0]], "gust": 1}}}, "air.wind.gust"),
         ({"air": {"wind": {"keys": [[0, 1, 0, 0]], "gusts": 2}}}, "expected 0 to 1"),
         ({"air": {"turbulence": {"strength": ".nan", "size": 1}}}, "air.turbulence.strength"),

@@ -116,10 +116,10 @@ def test_panels_show_decoded_original_and_error(lightmaps, show):
     window = show(lightmaps / "four.wlm", original=lightmaps / "set", mesh=lightmaps / "quad.glb")
     decoded, original, error = np.split(scene_of(window)[40:], 3, axis=1)
     assert np.abs(decoded - original).max() > 5 and np.abs(error - original).max() > 100
-    # The last quarter is outside the mask: filled in the original, 0 in the decoded light, and grey.
+    # The last quarter is outside the mask, where the window's colour is seen, and grey.
     flat = np.split(scene_of(show(lightmaps / "four.wlm", original=lightmaps / "set"))[40:], 3, axis=1)
     quarter = [part[part.shape[0] // 2 + 5 :, part.shape[1] // 2 + 2 :][:15, :15] for part in flat]
-    assert quarter[0].max() == 0 and quarter[1].min() > 50 and (quarter[2] == 77).all()
+    assert all((part == (27, 27, 31)).all() for part in quarter[:2]) and (quarter[2] == 77).all()
     drag(window, "error", 64)
     assert np.split(scene_of(window)[40:], 3, axis=1)[2].mean() > error.mean()
     window.turn(180.0)
@@ -231,7 +231,7 @@ def test_balls_are_where_their_probes_are(up, axes, tmp_path, show):
     origin, right, above, other = (
         np.argwhere((np.abs(picture - 255 * colour) < 40).all(2)).mean(0) for colour in colours
     )
-    assert above[0] < origin[0] - 20 and abs(above[1] - origin[1]) < 3
+    assert above[0] < origin[0] - 20 and abs(above[1] - origin[1]) < 5  # upright lines converge a little
     assert right[1] > origin[1] + 20 and right[0] > origin[0] + 5
     # Right-handed axes: z points to the viewer's left with y up, y away from the viewer with z up.
     assert other[1] < origin[1] - 20 if up == "y" else other[1] > origin[1] + 20

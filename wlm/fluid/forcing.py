@@ -16,6 +16,7 @@ from wlm_kernels.fluid.forcing import Modes
 EDDY = 4.0
 """Cells along the smallest wavelength of turbulence."""
 _MODES = 16
+_LARGEST = 1e18  # its square is within float32
 
 
 @dataclass(frozen=True)
@@ -76,8 +77,10 @@ class Wind:
 
     def __post_init__(self) -> None:
         keys = np.asarray(self.keys, np.float64)
-        if keys.ndim != 2 or keys.shape[1] != 4 or not (np.isfinite(keys).all() and (np.diff(keys[:, 0]) > 0).all()):
-            raise ValueError(f"keys: expected rows of an increasing time and a velocity, got {self.keys}")
+        small = (np.abs(keys) <= _LARGEST).all()
+        if keys.ndim != 2 or keys.shape[1] != 4 or not (small and (np.diff(keys[:, 0]) > 0).all()):
+            text = f"rows of an increasing time and a velocity, of numbers up to {_LARGEST:g}"
+            raise ValueError(f"keys: expected {text}, got {self.keys}")
         if not (0.0 <= self.gusts <= 1.0 and 0.0 < self.period < math.inf and self.seed >= 0):
             values = f"{self.gusts}, {self.period}, {self.seed}"
             raise ValueError(f"gusts, period, seed: expected 0 to 1, above 0, at least 0, got {values}")

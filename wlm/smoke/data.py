@@ -130,6 +130,10 @@ class Frames:
         """Returns the lights, colours and obstacles with which a frame is rendered; None without a scene."""
         return None if self.scene is None else self.scene.looks(number)
 
+    def _refuse_kelvin(self) -> None:
+        if self.options.get("kelvin"):
+            raise WlmError(f"{self.path}: kelvin: expected temperatures, whose unit it is, found none")
+
     def load(self, number: int) -> DensityVolume:
         """Reads the volume of a frame."""
         factors = self._factors
@@ -137,7 +141,10 @@ class Frames:
         if self.scene is not None and self.scene.smoke.fire is not None:
             options.setdefault("kelvin", True)
         if self.scene is not None or self.single:
-            return load_volume(self.file(number), **factors, device=self.device, **options)
+            volume = load_volume(self.file(number), **factors, device=self.device, **options)
+            if volume.temperature is None:
+                self._refuse_kelvin()
+            return volume
         if heads := grid_heads(self.file(number)):
             # All frames have the same grids; files from before the smoke or the fire may lack them.
             names = {head.name for head in heads}
@@ -216,7 +223,10 @@ def _frames_of_others(
             count = f"{len(without)} of {len(files)} frames"
             chosen.append(f"{folder}: {count} have no grid {density} and thus no smoke, the first is {without[0]}")
         warnings += chosen
-    return Frames(folder, None, files, device, extinction, emission, options, tuple(warnings))
+    frames = Frames(folder, None, files, device, extinction, emission, options, tuple(warnings))
+    if some and hot is None:
+        frames._refuse_kelvin()
+    return frames
 
 
 def _sequence(folder: Path) -> tuple[dict[int, Path], list[str]]:

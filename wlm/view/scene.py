@@ -14,7 +14,7 @@ class Slider:
     """A slider below the picture, with its range and the format of its label.
 
     Attributes:
-        name: Name, shown as a label; also the name of the command's option.
+        name: Name of the command's option.
         low, high: Range of values.
         value: Initial value.
         step: Change by one key press.
@@ -24,6 +24,7 @@ class Slider:
         wraps: Whether `high` is the same as `low`, as for hours of a day.
         clock: Whether the value is an hour of a day, which the label also shows as a clock time.
         views: Views in which it has an effect; empty for all.
+        label: Name that is shown; empty for `name`.
     """
 
     name: str
@@ -37,10 +38,11 @@ class Slider:
     wraps: bool = False
     clock: bool = False
     views: tuple[str, ...] = ()
+    label: str = ""
 
     def text(self, value: float) -> str:
         """Returns the label that shows a value of the slider: name, number and unit, and the clock time of an hour."""
-        shown = f"{self.name} {value:{self.form}}{self.unit}"
+        shown = f"{self.label or self.name} {value:{self.form}}{self.unit}"
         minutes = round(value * 60.0) % 1440
         return f"{shown} ({minutes // 60}:{minutes % 60:02})" if self.clock else shown
 

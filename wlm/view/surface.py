@@ -19,7 +19,7 @@ from wlm.view.canvas import Canvas
 from wlm.view.display import heat
 from wlm.view.scene import Scene, Slider, State
 
-_NO_CHART = 77  # grey level, as on the HTML pages
+_NO_CHART, _PAPER = 77, (27, 27, 31)  # colours outside charts of errors and of light, as on the HTML pages
 _SHARE = 0.6  # opacity of a tile's colour over the light
 _MESH = "mesh"
 _COLOURS = {
@@ -47,13 +47,13 @@ def compared(original: bool) -> tuple[str, ...]:
 @dataclass(kw_only=True)
 class SurfaceScene(Scene):
     """A scene of one lightmap of `height` x `width` texels on a mesh with lightmap UVs; `mask`, bool [H, W], are the
-    texels inside charts, None if unknown, and `brightness` is the exposure at 0 EV."""
+    texels inside charts, and `brightness` is the exposure at 0 EV."""
 
     geometry: Geometry
     brightness: float = 1.0
     height: int
     width: int
-    mask: np.ndarray | None = None
+    mask: np.ndarray
 
     @abstractmethod
     def lights(self, state: State) -> dict[str, np.ndarray]:
@@ -68,11 +68,11 @@ class SurfaceScene(Scene):
         for panel, name in enumerate(self.panels):
             if name == "error":
                 picture = display.error(lights["decoded"], lights["original"])
-                if self.flat and self.mask is not None:
-                    # These texels are not visible on the mesh, and are in no score.
-                    picture[~self.mask] = _NO_CHART
             else:
                 picture = display.picture(lights[name])
+            if self.flat:
+                # These texels are not visible on the mesh, and are in no score.
+                picture[~self.mask] = _NO_CHART if name == "error" else _PAPER
             if panel == 0 and state.view == "tiles":
                 mixed = _SHARE * 255.0 * self.tile_colours() + (1.0 - _SHARE) * picture
                 picture = (mixed + 0.5).astype(np.uint8)
@@ -109,12 +109,11 @@ def lightmap_scene(
         geometry=flat_geometry(height, width) if geometry is None else geometry,
         height=height,
         width=width,
-        mask=None if lightmaps is None else lightmaps.mask,
+        mask=model.mask if lightmaps is None else lightmaps.mask,
         model=model,
         lightmaps=lightmaps,
     )
-    lights = scene.lights(State({"hour": noon}, "light"))
-    scene.brightness = exposure(lights.get("original", lights["decoded"]))
+    scene.brightness = exposure(scene.lights(State({"hour": noon}, "light"))["decoded"])
     return scene
 
 
@@ -190,7 +189,7 @@ def atlas_scene(
         up=up,
         room=not flat and shape.is_room,
         geometry=flat_geometry(height, width) if flat else shape,
-        brightness=exposure(light.get("original", light["decoded"])[sheet.mask]),
+        brightness=exposure(light["decoded"][sheet.mask]),
         height=height,
         width=width,
         model=model,

@@ -18,16 +18,17 @@ STRIP = 108
 """Height in pixels of the strip with the sliders at the bottom; at most half of the window's height."""
 
 _HIDDEN = ("vtkEGLRenderWindow", "vtkOSOpenGLRenderWindow")  # windows that VTK opens if there is no display
-_BACKGROUND, _STRIP, _INK, _BAR = "#5a5d63", "#25272b", "#e8e8ea", "#8ab4f8"
+# Colours, first camera and perspective are those of the HTML pages, in their dark form.
+_BACKGROUND, _STRIP, _INK, _BAR = "#1b1b1f", "#2c2c33", "#e8e8e8", "#ffb454"
 _TITLE_PIXELS, _FONT, _TITLE_FONT = 26, 9, 10
 # Positions in the strip, as fractions of its height and width.
 _LABELS, _BARS, _CAPTION, _KEYS, _INDENT, _LEAST_CELLS = 0.76, 0.64, 0.30, 0.06, 0.01, 3
-_EYE = (1.0, 0.8, 1.0)  # direction of the first camera, with y up
-_MARGIN = 1.06
+_EYE = (0.5654, 0.4794, 0.6712)  # direction of the first camera, with y up
+_MARGIN, _VIEW_ANGLE = 1.0 / 0.93, 45.24  # degrees
 _SWEEP = 12.0  # seconds to play a slider of real values once
 _TICK = 30  # milliseconds
 _EXPOSURE = Slider("exposure", -8.0, 8.0, 0.0, 0.5, "+.1f", unit=" EV")
-_ERROR = Slider("error", 1.0, 64.0, 8.0, 1.0, ".0f", "×", whole=True)
+_ERROR = Slider("error", 1.0, 64.0, 8.0, 1.0, ".0f", "×", whole=True, label="error factor")
 
 
 class Window:
@@ -255,6 +256,7 @@ class Window:
         """Places the camera so that it sees the whole scene."""
         first = self.canvas.renderers[0]
         camera = first.camera
+        camera.view_angle = _VIEW_ANGLE
         low, high = self.scene.box() or np.array(first.ComputeVisiblePropBounds()).reshape(3, 2).T
         middle = 0.5 * (low + high)
         x, y, z = _EYE

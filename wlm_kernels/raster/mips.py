@@ -64,6 +64,23 @@ def _between(stacks: _Stacks, level: wp.array1d[float], i: int):
 
 
 @wp.kernel
+def _sample_one(
+    # in:
+    texture: wp.array3d[float],
+    uv: wp.array1d[wp.vec2],
+    filter: int,
+    boundary: int,
+    # out:
+    out: wp.array2d[float],
+):
+    i = wp.tid()
+    x = axis_at(uv[i][0], texture.shape[1], filter, boundary)
+    y = axis_at(uv[i][1], texture.shape[0], filter, boundary)
+    for c in range(texture.shape[2]):
+        out[i, c] = read(texture, x, y, c)
+
+
+@wp.kernel
 def _sample(
     # in:
     texture: wp.array3d[float],
@@ -156,6 +173,11 @@ def sample(
         level: float [B N]; None: the first one.
         filter, boundary: Names, see `texture.codes`.
     """
+    if size is None:
+        # A quarter faster than by `_sample`.
+        inputs = [texture, uv, *codes(filter, boundary)]
+        wp.launch(_sample_one, uv.shape, inputs=inputs, outputs=[out], device=texture.device)
+        return
     level = wp.empty(0, dtype=float, device=texture.device) if level is None else level
     inputs = [texture, _stacks(texture, size, levels, uv), uv, level, *codes(filter, boundary)]
     wp.launch(_sample, uv.shape, inputs=inputs, outputs=[out], device=texture.device)

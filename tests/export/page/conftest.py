@@ -33,7 +33,8 @@ def show(browser):
     errors, contexts = [], []
 
     def load(path, *, unpacked=False, width=900, height=600, touch=False):
-        context = browser.new_context(viewport={"width": width, "height": height}, has_touch=touch)
+        options = {"has_touch": touch, "color_scheme": "dark"}
+        context = browser.new_context(viewport={"width": width, "height": height}, **options)
         contexts.append(context)
         page = context.new_page()
         page.on("pageerror", lambda error: errors.append(str(error)))

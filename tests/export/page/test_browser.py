@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from builders import atlas_meshes, atlas_models, day_scenes, probe_models, probe_sets, rooms, small_sets
+from builders import atlas_meshes, atlas_models, day_scenes, probe_sets, rooms, small_sets
 from builders.light_groups import random_groups
 from builders.page_numbers import numbers
 from builders.synthetic import random_model
@@ -327,43 +327,6 @@ def test_the_walls_of_a_room_are_seen_from_inside_alone(model, tmp_path, show):
     room = np.array(outside.shape[:2])
     assert (lit.min(0) > 0).all() and (lit.max(0) < room - 1).all()
     assert ((lit.max(0) - lit.min(0)) / room).max() > 0.8
-
-
-@pytest.mark.parametrize("kind", ["tiles", "cascade", _long("plain"), _long("plain with uv")])
-def test_atlases_read_as_in_python(kind, tmp_path, show):
-    mesh = atlas_meshes.sheet()
-    model = atlas_models.random_model(mesh, kind)
-    model.save(tmp_path / "sheet.wlm")
-    write_page(tmp_path / "page.html", [tmp_path / "sheet.wlm"])
-    page = show(tmp_path / "page.html")
-    uv = np.random.default_rng(0).random((500, 2)).astype(np.float32)
-    expected = model.decoder().read(torch.from_numpy(uv)).numpy()
-    seen = numbers(page, f"kind.read({uv.ravel().tolist()})").reshape(-1, 4)[:, :3]
-    assert np.abs(seen - expected).max() < 2 / 255 * expected.max()
-    assert picture(page).max() > 100
-    before = picture(page)
-    page.get_by_role("button", name="unwrapped").click()
-    assert np.abs(picture(page) - before).max() > 20
-    text = help_of(page)
-    assert "exposure" in text and "turn the camera" in text
-    for words in ("hour", "frame", "play", "original", "error"):
-        assert words not in text
-
-
-@pytest.mark.parametrize("outputs", [27, _long(12), _long(48)])
-def test_probes_decode_as_in_python(outputs, tmp_path, show):
-    model = probe_models.whole_model(count=12, probes=40, outputs=outputs, positions=True)
-    model.save(tmp_path / "probe.wlm")
-    position = np.array([[0.0, 0, 0], [4, 0, 0], [0, 2, 0]]) + model.origin
-    document, _ = document_from_arrays(position, np.array([[0, 1, 2]]), np.zeros((3, 2)), "triangle")
-    write_glb(tmp_path / "triangle.glb", document, [], 0)
-    write_page(tmp_path / "page.html", [tmp_path / "probe.wlm"], mesh=tmp_path / "triangle.glb")
-    page = show(tmp_path / "page.html")
-    live = ~model.dead
-    expected = model.decoder().decode(model.stored_positions()[live])[:, :27]
-    seen = numbers(page, "kind.read()").reshape(-1, 27)[:, : expected.shape[1]]
-    assert np.abs(seen - expected).max() < 3 / 255 * np.abs(expected).max()
-    assert picture(page).max() > 100
 
 
 def test_principal_components_and_light_between_probes_decode_as_in_python(tmp_path, show):

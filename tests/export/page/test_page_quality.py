@@ -80,11 +80,19 @@ def test_the_keyboard_turns_the_camera(tmp_path, show):
         page.keyboard.press(key)
     now = page.evaluate(turned)
     assert now[0] != yaw and now[1] > pitch and now[2] < distance
+    page.locator("summary").click()
+    text = page.locator("details").inner_text()
+    assert "turn the camera" in text and not any(word in text for word in ("hour", "frame", "play", "original"))
 
 
 @pytest.mark.slow
 def test_a_picture_within_two_seconds(made, show):
     """Of three times the shortest, since other work may delay a page."""
-    second = "requestAnimationFrame(() => requestAnimationFrame(() => done(performance.now())))"
-    frame = f"wlm.then(() => new Promise((done) => {second}))"
-    assert min(show(made).evaluate(frame) for _ in range(3)) < 2000
+    wait = "while (!shown.first) await new Promise(requestAnimationFrame)"
+    drawn = f"wlm.then(async (shown) => {{ {wait}; return shown.first; }})"
+    spent = []
+    for _ in range(3):
+        page = show(made)
+        spent.append(page.evaluate(drawn))
+        page.close()  # which would go on drawing
+    assert min(spent) < 2000

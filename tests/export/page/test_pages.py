@@ -133,11 +133,6 @@ def test_a_dark_hour_has_no_score_and_its_page_is_made(tmp_path):
     assert scores[0] > 0 and scores[1] is None
 
 
-def test_probes_of_which_none_is_dead_have_a_page(tmp_path):
-    probe_models.whole_model(probes=50, dead=0, positions=True).save(tmp_path / "live.wlm")
-    assert make_page([tmp_path / "live.wlm"]).manifest["probe"]["count"] == 50
-
-
 def test_frames_of_smoke_are_of_one_size(tmp_path):
     for name, size in (("a_1", 8), ("a_2", 4)):
         camera = Camera.look_at((0.0, 0.0, 1.0), np.zeros(3), extent=1.0, height=size, width=size)

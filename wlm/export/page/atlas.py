@@ -48,11 +48,12 @@ def atlas_page(
         arrays["coordinate"] = model.uv[mesh.active].reshape(-1, 2).astype(np.float32)
     if model.method != "plain":
         arrays["lut"] = np.ascontiguousarray(model.lut, np.uint16)
+    decoded = model.decoder().lightmap()
     manifest: dict[str, Any] = {
         "width": width,
         "height": height,
         "shader": glsl(model),
-        "exposure": exposure(np.concatenate([model.texels.ravel(), model.block_texels.ravel()]).astype(np.float32)),
+        "exposure": exposure(decoded[mesh.mask]),
         "atlas": {
             "method": model.method,
             "colour": texels.shape[1::-1],
@@ -76,7 +77,7 @@ def atlas_page(
         arrays["original_0"] = pack_rgb9e5(fill_gaps(light, mesh.mask))
         arrays["mask"] = mesh.mask.astype(np.uint8) * 255
         manifest["reference"] = {"times": [0.0]}
-        error = float(np.square(model.decoder().lightmap() - light)[mesh.mask].mean(dtype=np.float64))
+        error = float(np.square(decoded - light)[mesh.mask].mean(dtype=np.float64))
         scores = [("PSNR of texels", f"{psnr_from_mse(error, float(np.ptp(light[mesh.mask]))):.2f} dB")]
     stored = int(np.subtract(*codec.sizes(model)))
     figures = [

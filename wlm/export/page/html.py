@@ -27,9 +27,9 @@ _COMMON = ("content.js", "graphics.js", "blocks.js", "camera.js", "panel.js", "l
 class Page:
     """The content of a page.
 
-    Its kind, `lightmap`, `atlas`, `probe`, `smoke` or `scene`, selects the main script, which may need further
-    `scripts` and reads `manifest`, JSON values, and `arrays` by name. The panel shows the title, a sentence below it,
-    which may be empty, and the table `figures`, of a name and a text each.
+    Its kind, `lightmap`, `atlas`, `probe`, `smoke`, `scene` or `viewer`, selects the main script, which may need
+    further `scripts` and reads `manifest`, JSON values, and `arrays` by name. The panel shows the title, a sentence
+    below it, which may be empty, and the table `figures`, of a name and a text each.
     """
 
     kind: str

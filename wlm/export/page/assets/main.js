@@ -28,6 +28,8 @@ async function start(page, signal) {
   for (const [name, text] of manifest.figures) panel.figure(name, text);
   panel.key('h', 'H', 'fold this panel', panel.fold);
   document.getElementById('message').hidden = true;
+  // For scripts; `first` is when the first picture was drawn, in milliseconds.
+  const shown = {kind, page, manifest, graphics, first: undefined};
   const loop = (time) => {
     if (signal?.aborted) {
       // Browsers keep few contexts.
@@ -45,6 +47,7 @@ async function start(page, signal) {
         dirty = false;
         drawn = time;
         kind.draw();
+        shown.first ??= performance.now();
       }
     } catch (error) {
       fail(error);
@@ -55,7 +58,7 @@ async function start(page, signal) {
   window.addEventListener('resize', changed, {signal});
   matchMedia('(prefers-color-scheme: light)').addEventListener('change', changed, {signal});
   requestAnimationFrame(loop);
-  return {kind, page, manifest, graphics};
+  return shown;
 }
 
 // A script awaits `wlm` and calls `kind.read(...)`; of the viewer it calls `open(files)`, which gives the same.

@@ -62,17 +62,29 @@ async function readExr(bytes) {
   return {width, height, planes};
 }
 
+async function readSixWay(file) {
+  try {
+    const exr = await readExr(new Uint8Array(await file.arrayBuffer())), {planes} = exr;
+    const missing = [...SIX_WAY, 'transparency'].find((name) => !(name in planes));
+    if (missing) throw new Error(`expected six-way lightmaps, found no channel ${missing}`);
+    if (Object.values(planes).some((plane) => !plane.every(Number.isFinite))) throw new Error('expected finite numbers, found NaN or infinity');
+    return exr;
+  } catch (error) {
+    throw named(file, error);
+  }
+}
+
 // Frames in the order of the numbers in their names.
 async function openSmoke(files) {
   const order = new Intl.Collator('en', {numeric: true}), sorted = [...files].sort((a, b) => order.compare(a.name, b.name));
   const arrays = {}, most = [];
   let size, hot = false;
   for (const [number, file] of sorted.entries()) {
-    const {width, height, planes} = await readExr(new Uint8Array(await file.arrayBuffer()));
-    const missing = [...SIX_WAY, 'transparency'].find((name) => !(name in planes));
-    if (missing) throw new Error(`${file.name}: expected six-way lightmaps, found no channel ${missing}`);
+    const {width, height, planes} = await readSixWay(file);
     size ??= [width, height];
-    if (size.join() !== [width, height].join()) throw new Error(`${file.name}: expected ${size.join('x')} pixels as the first frame, found ${width}x${height}`);
+    if (size.join() !== [width, height].join()) {
+      throw new Error(`${file.name}: expected ${size.join('x')} pixels as the first frame, found ${width}x${height}`);
+    }
     const largest = (names) => names.reduce((top, name) => planes[name].reduce((a, b) => Math.max(a, b), top), 1e-12);
     const scales = [largest(SIX_WAY), 1, planes.emission ? largest(['emission']) : 1e-12];
     hot ||= 'emission' in planes;

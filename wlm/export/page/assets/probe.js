@@ -173,11 +173,11 @@ void main() { colour = vec4(wlm_shown(v_decoded, v_original), 1.0); }`);
     const {graphics} = this, {gl} = graphics;
     const places = this.groups.map((group) => group.places).find((each) => each.done < each.count);
     if (!places) return false;
+    // At least half of the time, regardless of the drawing time; the first picture comes soon.
+    const until = performance.now() + (this.began ? Math.max(30, elapsed) : 30);
     this.began ??= performance.now();
     gl.disable(gl.DEPTH_TEST);
     gl.enable(gl.SCISSOR_TEST);
-    // At least half of the time, regardless of the drawing time.
-    const until = performance.now() + Math.max(30, elapsed);
     while (places.done < places.count && performance.now() < until) {
       const column = places.done % WIDTH, row = Math.floor(places.done / WIDTH);
       const many = Math.min(ROW, WIDTH - column, places.count - places.done);

@@ -1,8 +1,8 @@
 // Describes the texel under the pointer in the panel.
 
 const PLACES = `${HEAD}
-in vec2 v_uv;
-in vec2 v_coordinate;
+centroid in vec2 v_uv;
+centroid in vec2 v_coordinate;
 out vec4 place;
 void main() { place = vec4(v_uv, v_coordinate); }`;
 const NOWHERE = -1e9;  // beyond any UV

@@ -1,4 +1,5 @@
-// A lightmap on a mesh, or unwrapped as a picture.
+// A lightmap on a mesh, or unwrapped as a picture. Coordinates are read inside triangles (`centroid`): at a pixel's middle
+// outside of one they may be those of a gap, far from the chart, which shows as a dark rim.
 
 const SURFACE = `${HEAD}
 in vec3 a_position;
@@ -7,8 +8,8 @@ in vec2 a_coordinate;
 uniform mat4 u_camera;
 uniform bool u_unwrapped;
 uniform float u_aspect;
-out vec2 v_uv;
-out vec2 v_coordinate;
+centroid out vec2 v_uv;
+centroid out vec2 v_coordinate;
 void main()
 {
     v_uv = a_uv;
@@ -23,8 +24,8 @@ class Surface {
     const {manifest} = page;
     Object.assign(this, {graphics, display, changed, aspect: manifest.width / manifest.height});
     this.program = graphics.program(SURFACE, `${HEAD}
-in vec2 v_uv;
-in vec2 v_coordinate;
+centroid in vec2 v_uv;
+centroid in vec2 v_coordinate;
 uniform sampler2D u_original, u_mask;
 uniform bool u_unwrapped;
 uniform vec3 u_paper;

@@ -1,12 +1,18 @@
 // The viewer: opens files that are dropped or chosen, in the browser alone.
 
+// An error with the name of its file. A damaged header may name what does not exist.
+function named({name}, error) {
+  const damaged = error instanceof TypeError || error instanceof RangeError;
+  return new Error(`${name}: ${damaged ? 'the file is damaged' : error.message}`, {cause: error});
+}
+
 // Makes the content of a page from files: one .wlm, which a mesh may come with, or EXRs of smoke.
 async function openFiles(files, manifest) {
-  const named = (ending) => files.filter(({name}) => name.toLowerCase().endsWith(ending));
-  const [file, ...more] = named('.wlm'), meshes = named('.glb');
+  const ending = (end) => files.filter(({name}) => name.toLowerCase().endsWith(end));
+  const [file, ...more] = ending('.wlm'), meshes = ending('.glb');
   if (!file) {
-    if (!named('.exr').length) throw new Error('expected a .wlm file, or six-way lightmaps of smoke (.exr)');
-    return openSmoke(named('.exr'));
+    if (!ending('.exr').length) throw new Error('expected a .wlm file, or six-way lightmaps of smoke (.exr)');
+    return openSmoke(ending('.exr'));
   }
   if (more.length || meshes.length > 1) throw new Error('expected one .wlm file, and at most one mesh');
   try {
@@ -25,8 +31,7 @@ async function openFiles(files, manifest) {
     }
     return page;
   } catch (error) {
-    // A damaged header may name what does not exist.
-    throw new Error(`${file.name}: ${error instanceof TypeError || error instanceof RangeError ? 'the file is damaged' : error.message}`, {cause: error});
+    throw named(file, error);
   }
 }
 
@@ -55,7 +60,7 @@ async function openViewer() {
   const empty = () => {
     button.textContent = 'choose a file';
     home.replaceChildren(Object.assign(document.createElement('h1'), {textContent: manifest.title}), note, button, input);
-    message.hidden = true;
+    message.textContent = 'drop a file here';
   };
   let current = new AbortController();
   const open = async (files) => {
@@ -88,7 +93,7 @@ async function openViewer() {
     if (event.dataTransfer.files.length) window.wlm = open(event.dataTransfer.files);
   });
   empty();
-  return {open};
+  return {open, first: performance.now()};
 }
 
 // The exposure at which all but a hundredth of the numbers above 0 are at most 0.8 on the screen.
