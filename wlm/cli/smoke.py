@@ -180,24 +180,22 @@ def predict(
     output: _Lightmaps,
     options: FrameOptions,
     network: Annotated[
-        Path | None, typer.Option(metavar="FILE", help='File of wlm smoke train; default "fast", which ships with wlm.')
+        Path | None,
+        typer.Option(metavar="FILE", help='Network: a file of wlm smoke train, or "fast", which ships with wlm.'),
     ] = None,
-    coarse: Annotated[bool, typer.Option("--coarse", help="Only use a coarse ray march, without a network.")] = False,
     seed: Seed = 0,
 ) -> None:
-    """Predict six-way lightmaps with a network from a coarse march: like bake, in less time.
+    """Predict six-way lightmaps by a coarse ray march: like bake, in less time.
 
-    The files are like those of bake. Finished frames are kept when the command is stopped; repeat it with --resume to
-    make the others.
+    With --network a network removes the noise of an even coarser march. The files are like those of bake. Finished
+    frames are kept when the command is stopped; repeat it with --resume to make the others.
     """
-    if coarse and network is not None:
-        raise WlmError("--coarse: expected no --network, since --coarse uses no network")
     console.quiet_warp()
     from wlm.smoke.codec import open_network
 
     made: dict[str, Any] = {"made": "coarse", "seed": seed}
     method: Any = "coarse"
-    if not coarse:
+    if network is not None:
         method = open_network(network)
         made |= {"made": "network", "of": dict(method.summary)}
     write_lightmaps(options, smoke, output, (method, {"seed": seed}), made)
