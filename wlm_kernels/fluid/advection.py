@@ -7,7 +7,8 @@ Read `tests/reference/advection.py` first: it is the same step in float64 NumPy,
   rule (second-order Runge-Kutta). Unconditionally stable, no new extrema, first order. x_d - x is computed at the
   centres of coarse cells (`advection_places.trace`) and is trilinear between them, as the velocities are.
 - MacCormack (Selle et al. 2008): with A a semi-Lagrangian step and A* the step back in time, rho' = A rho + (rho - A* A
-  rho) / 2, clamped to the eight values that A interpolates. Second order where the field is smooth.
+  rho) / 2. It is clamped to the least of the eight values that A interpolates; above the largest it is A rho alone,
+  since clamps at both ends add smoke: more values end below than above. Second order where the field is smooth.
 
 Neither scheme conserves mass.
 
@@ -261,8 +262,9 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
     def corrected(
         field: wp.array1d[stored], predicted: wp.array1d[stored], i: int, to: Corners, low: float, high: float
     ) -> float:
-        change = 0.5 * (value_at(field, i) - interpolate(predicted, to))
-        return wp.clamp(value_at(predicted, i) + change, low, high)
+        value = value_at(predicted, i)
+        better = value + 0.5 * (value_at(field, i) - interpolate(predicted, to))
+        return wp.where(better > high, value, wp.max(better, low))
 
     @wp.func
     def write(i: int, smoke: float, heat: float, decay: wp.vec2, out: fields_type) -> float:
