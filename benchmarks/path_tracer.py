@@ -2,7 +2,7 @@
 
 Path tracing estimates the same integral as ray marching, independently: many samples check the ray march, few samples
 show the quality that a path tracer reaches in the time of a frame. Mitsuba traces on the CPU here; the path tracer
-that is measured on a GPU is `wlm.smoke.transport.tracing`.
+that is measured on a GPU is `benchmarks.smoke_tracing`.
 """
 
 import functools

@@ -40,6 +40,7 @@ from torch.nn.functional import interpolate
 from benchmarks.plot import Panel
 from benchmarks.rows import Row
 from benchmarks.runner import Bench, Note
+from benchmarks.smoke_tracing import trace
 from demos.plume import make_plume
 from wlm.fluid.bricks import BrickPool
 from wlm.fluid.faces import FACES
@@ -57,7 +58,6 @@ from wlm.smoke.shading import Light, PointLight
 from wlm.smoke.simulation import advance, make_solver, volume_of
 from wlm.smoke.transport.lighting import light_smoke
 from wlm.smoke.transport.orders import scatter
-from wlm.smoke.transport.tracing import trace
 from wlm.view.smoke import Drawing
 from wlm.view.smoke_run import Lighting
 from wlm_kernels.fluid import advection, advection_places

@@ -13,6 +13,7 @@ import torch.nn.functional as F
 import warp as wp
 
 from benchmarks.smoke import make_noise
+from benchmarks.smoke_tracing import trace
 from demos.plume import make_plume
 from wlm.fluid.volume import DensityVolume
 from wlm.formats.atomic import atomic_path
@@ -22,7 +23,6 @@ from wlm.smoke.camera import Camera
 from wlm.smoke.network.planes import to_srgb
 from wlm.smoke.shading import Light
 from wlm.smoke.transport.orders import ALBEDOS, Inputs, OrdersModel, make_inputs, orders_march
-from wlm.smoke.transport.tracing import trace
 from wlm_kernels.smoke import orders
 from wlm_kernels.smoke.orders import FEATURES, MIXES
 

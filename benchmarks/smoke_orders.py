@@ -49,6 +49,7 @@ from benchmarks.rows import Row
 from benchmarks.runner import Bench, Note
 from benchmarks.smoke import make_cloud
 from benchmarks.smoke_learning import FAINT, at, draw_view, psnr
+from benchmarks.smoke_tracing import Transport, trace
 from benchmarks.timing import Timing
 from demos.plume import make_plume
 from wlm.fluid.volume import DensityVolume
@@ -63,7 +64,6 @@ from wlm.smoke.shading import Light, PointLight
 from wlm.smoke.simulation import advance, make_solver, volume_of
 from wlm.smoke.transport.lighting import LitSmoke, light_smoke
 from wlm.smoke.transport.orders import OrdersModel, load_orders, make_inputs, orders_march, scatter
-from wlm.smoke.transport.tracing import Transport, trace
 
 METHOD, GRIDS, PHASES, INSIDE = "all orders", "gain by grid", "phase functions", "light in smoke"
 """The tables of the rows."""

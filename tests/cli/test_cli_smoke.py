@@ -46,7 +46,7 @@ def camera_of(volume, **settings):
     ("words", "method", "other"),
     [
         (["bake", "--step", 1], "bake", ["--step", 2]),
-        pytest.param(["predict", "--coarse"], "coarse", ["--seed", 7], marks=pytest.mark.slow),
+        pytest.param(["predict"], "coarse", ["--seed", 7], marks=pytest.mark.slow),
     ],
 )
 def test_frames_that_were_made_are_not_made_again(words, method, other, frames, tmp_path, monkeypatch):
@@ -119,7 +119,7 @@ def test_every_route_keeps_the_scene(tmp_path):
     folder, small = write_frames(tmp_path / "a", smoke=smoke, frames=2, **looks).path, CameraSettings(resolution=20)
     for number in (1, 2):
         save_volume(folder / f"frame_{number:04d}.npz", plume(number + 1, hot=True))
-    for name, words in {"bake": ["bake", "--step", 1], "coarse": ["predict", "--coarse"]}.items():
+    for name, words in {"bake": ["bake", "--step", 1], "coarse": ["predict"]}.items():
         call("smoke", *words, folder, "-o", tmp_path / name, "--resolution", 20)
         call("smoke", "shade", tmp_path / name, "-o", tmp_path / f"{name}_s")
     scene = load_frames(folder)
@@ -130,7 +130,7 @@ def test_every_route_keeps_the_scene(tmp_path):
         given = [settings.light() for settings in looks.lights]
         expected = np.int32(to_bytes(picture(six, given, background=looks.background, **extra)))
         for name in ("bake", "coarse"):
-            # Half floats, and for `--coarse` the steps of its march.
+            # Half floats, and for `predict` the steps of its march.
             error = np.abs(np.int32(png(tmp_path / f"{name}_s" / f"shade_{number:04d}.png")) - expected)
             assert error.max() <= 1 if name == "bake" else (error.mean() < 2 and error.max() < 40), name
     # One file has them too.

@@ -31,7 +31,7 @@ def test_run_is_what_its_stages_are_one_by_one(scene, tmp_path):
     for stage in ("simulation", "lightmaps", "shadows and picture", "bytes", "writing"):
         assert stage in text
     call("smoke", "simulate", scene, "-o", tmp_path / "frames")
-    call("smoke", "predict", tmp_path / "frames", "--coarse", "-o", tmp_path / "six")
+    call("smoke", "predict", tmp_path / "frames", "-o", tmp_path / "six")
     call("smoke", "shade", tmp_path / "six", "-o", tmp_path / "shaded")
     for number in (1, 2, 3):
         made = png(tmp_path / "run" / f"run_{number:04d}.png")

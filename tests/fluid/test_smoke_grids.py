@@ -11,7 +11,7 @@ from builders.nvdb_files import LEVEL_SET, nvdb_file, raw_grid
 from builders.vdb_files import ACTIVE_MASK, scaled, tree, vdb_file
 
 from wlm.errors import WlmError
-from wlm.fluid.black_body import black_body_luminance
+from wlm.fluid.black_body import black_body_colour, black_body_luminance
 from wlm.fluid.grids import choose
 from wlm.fluid.volume import load_volume, save_volume, thickness_hint
 from wlm.formats.vdb import GridHead
@@ -243,6 +243,16 @@ def test_black_bodies():
             expected, rel=0.05 if kelvin > 500 else 0.5
         )
     assert black_body_luminance(np.array([-1.0, 0.0, 100.0])).tolist() == [0.0, 0.0, 0.0]
+
+
+def test_colours_of_black_bodies():
+    """The Planckian locus of the CIE's observer of 1931, x and y, where it is within Rec. 709 or nearly so."""
+    locus = {2000: (0.5267, 0.4133), 3000: (0.4369, 0.4041), 4000: (0.3805, 0.3768), 6500: (0.3135, 0.3237)}
+    colours = black_body_colour(np.array([*locus], float))
+    to_xyz = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
+    xyz = colours @ to_xyz.T
+    np.testing.assert_allclose(xyz[:, :2] / xyz.sum(1, keepdims=True), [*locus.values()], atol=0.003)
+    np.testing.assert_allclose(xyz[:, 1], 1.0, rtol=1e-3)
 
 
 def test_a_sequence_in_kelvin(tmp_path: Path):

@@ -87,7 +87,7 @@ _FORMS: tuple[tuple[Any, ...], ...] = (
     ("smoke", "shade", BOOKS, "--with", BOOKS, "--from", LAYOUTS, "--cells", ("1x1", "2x2", "5x3"), "-o", "OUT.png"),
     ("smoke", "bake", VOLUMES, "--resolution", "8", "-o", "OUT.exr"),
     ("smoke", "light", VOLUMES, "--resolution", "8", "--orders", "single", "-o", "OUT.exr"),
-    ("smoke", "predict", VOLUMES, "--coarse", "--resolution", "8", "-o", "OUT.exr"),
+    ("smoke", "predict", VOLUMES, "--resolution", "8", "-o", "OUT.exr"),
     ("inspect", MESHES + LIGHTS + LEVELS + MODELS + PROBES + SETS + VOLUMES + BOOKS + LISTS),
 )
 

@@ -13,6 +13,7 @@ import pytest
 import warp as wp
 
 import wlm_kernels
+from benchmarks import smoke_path
 from wlm_kernels import mlp
 from wlm_kernels.fluid import advection, advection_sources, fire, lattice, lattice_bodies, lattice_fields, lattice_links
 from wlm_kernels.lightmap import decode as lightmap_decode
@@ -23,7 +24,7 @@ from wlm_kernels.probe import decode as probe_decode
 from wlm_kernels.probe import gaussian_sum
 from wlm_kernels.probe import network as probe_network
 from wlm_kernels.probe import step as probe_step
-from wlm_kernels.smoke import depth_lattice, diffusion, march_six, marches, naf_block, path, planes, single_scatter
+from wlm_kernels.smoke import depth_lattice, diffusion, march_six, marches, naf_block, planes, single_scatter
 from wlm_kernels.smoke import march as smoke_march
 
 KERNELS = Path(wlm_kernels.__file__).parent
@@ -82,8 +83,8 @@ def _smoke(dtype: type) -> list:
     """Builds all kernels that take smoke, for densities of one type."""
     smoke = smoke_march.smoke_struct(dtype, True)
     variants = {"_guide": (True,), "_coarse": (dtype is wp.float16,), "_measure": (2,)}
-    built = [smoke_march.occupied_kernel(dtype)]
-    for module in (marches, march_six, depth_lattice, diffusion, path):
+    built = [smoke_march.occupied_kernel(dtype), smoke_path._coarser]
+    for module in (marches, march_six, depth_lattice, diffusion, smoke_path):
         # Functions of Warp have a `build`, too.
         built_by = {name: value for name, value in vars(module).items() if not isinstance(value, wp.Function)}
         launchers = {name: value.build for name, value in built_by.items() if hasattr(value, "build")}

@@ -142,5 +142,5 @@ class Domain:
                 continue
             value = predicted[cell] + 0.5 * (field[cell] - self.read(predicted, q))
             values = [field[c] for c, _ in self.corners(self.into_domain(p), self.shape)]
-            out[cell] = np.clip(value, min(values), max(values))
+            out[cell] = predicted[cell] if value > max(values) else max(value, min(values))
         return out

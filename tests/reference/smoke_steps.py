@@ -167,7 +167,7 @@ class Smoke:
                 back = self._read(predicted.reshape(self.n), q)
                 around = np.stack([values[c] for c, _ in self._corners(inside, self.n)])
                 raw = predicted + 0.5 * (values.ravel() - back)
-                out = np.where(plain, predicted, np.clip(raw, around.min(0), around.max(0)))
+                out = np.where(plain | (raw > around.max(0)), predicted, np.maximum(raw, around.min(0)))
             results.append(decay * out.reshape(self.n))
         return results
 

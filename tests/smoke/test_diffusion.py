@@ -10,6 +10,7 @@ import torch
 from builders.smoke_plumes import plume
 
 from benchmarks.smoke_learning import psnr
+from benchmarks.smoke_tracing import trace
 from demos.plume import make_plume
 from wlm.fluid.volume import DensityVolume, from_array
 from wlm.smoke.camera import Camera, unit
@@ -17,7 +18,6 @@ from wlm.smoke.shading import Light, PointLight, Ramp, half_sphere
 from wlm.smoke.transport.diffusion import CoarseSmoke, share_of
 from wlm.smoke.transport.lighting import light_smoke, marching
 from wlm.smoke.transport.orders import orders_march, scatter
-from wlm.smoke.transport.tracing import trace
 from wlm_kernels.smoke import diffusion as kernels
 
 

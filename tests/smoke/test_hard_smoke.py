@@ -7,6 +7,7 @@ import pytest
 import torch
 from builders.smoke_plumes import facing
 
+from benchmarks.smoke_tracing import trace
 from demos.plume import make_plume
 from wlm.fluid.volume import DensityVolume, from_array
 from wlm.smoke.camera import Camera
@@ -14,7 +15,6 @@ from wlm.smoke.march.six_way import bake, bake_coarse, guide
 from wlm.smoke.shading import Light, PointLight
 from wlm.smoke.transport.lighting import light_smoke
 from wlm.smoke.transport.orders import scatter
-from wlm.smoke.transport.tracing import trace
 from wlm_kernels.smoke.settings import March
 
 STEPS = March(2.0, jitter=0.0, threshold=1e-6)

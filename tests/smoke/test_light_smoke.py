@@ -8,13 +8,13 @@ import torch
 from builders.smoke_plumes import facing
 from reference.single_light import lit
 
+from benchmarks.smoke_tracing import trace
 from demos.plume import make_plume
 from wlm.fluid.volume import from_array
 from wlm.smoke.camera import Camera
 from wlm.smoke.march.six_way import bake
 from wlm.smoke.shading import Light, PointLight, sky_lights
 from wlm.smoke.transport.lighting import fine_march, light_smoke
-from wlm.smoke.transport.tracing import trace
 from wlm_kernels.smoke.settings import March
 
 WAYS = [(1.0, 0.7, 0.8), (-0.3, -0.9, 0.5), (0.0, 0.0, -1.0)]

@@ -20,13 +20,13 @@ from benchmarks.smoke_learning import (
     psnr,
     save_orders,
 )
+from benchmarks.smoke_tracing import trace
 from demos.plume import make_plume
 from wlm.errors import WlmError
 from wlm.fluid.volume import DensityVolume
 from wlm.smoke.camera import Camera
 from wlm.smoke.shading import Light, PointLight
 from wlm.smoke.transport.orders import ALBEDOS, Inputs, OrdersModel, load_orders, make_inputs, orders_march, scatter
-from wlm.smoke.transport.tracing import trace
 from wlm_kernels.smoke.orders import FEATURES, MIXES
 from wlm_kernels.smoke.settings import March
 

@@ -180,24 +180,22 @@ def predict(
     output: _Lightmaps,
     options: FrameOptions,
     network: Annotated[
-        Path | None, typer.Option(metavar="FILE", help='File of wlm smoke train; default "fast", which ships with wlm.')
+        Path | None,
+        typer.Option(metavar="FILE", help='Network: a file of wlm smoke train, or "fast", which ships with wlm.'),
     ] = None,
-    coarse: Annotated[bool, typer.Option("--coarse", help="Only use a coarse ray march, without a network.")] = False,
     seed: Seed = 0,
 ) -> None:
-    """Predict six-way lightmaps with a network from a coarse march: like bake, in less time.
+    """Predict six-way lightmaps by a coarse ray march: like bake, in less time.
 
-    The files are like those of bake. Finished frames are kept when the command is stopped; repeat it with --resume to
-    make the others.
+    With --network a network removes the noise of an even coarser march. The files are like those of bake. Finished
+    frames are kept when the command is stopped; repeat it with --resume to make the others.
     """
-    if coarse and network is not None:
-        raise WlmError("--coarse: expected no --network, since --coarse uses no network")
     console.quiet_warp()
     from wlm.smoke.codec import open_network
 
     made: dict[str, Any] = {"made": "coarse", "seed": seed}
     method: Any = "coarse"
-    if not coarse:
+    if network is not None:
         method = open_network(network)
         made |= {"made": "network", "of": dict(method.summary)}
     write_lightmaps(options, smoke, output, (method, {"seed": seed}), made)
@@ -227,31 +225,23 @@ def light(
     orders: Annotated[
         Literal["all", "single"], typer.Option(help="Orders of scattering: all, or single scattering only.")
     ] = "all",
-    samples: Annotated[
-        int | None, typer.Option(min=2, max=2**20, help="Trace this many paths per pixel instead of marching.")
-    ] = None,
     background: Background = None,
     white: White = 1.0,
 ) -> None:
-    """Draw lit smoke: by a ray march towards each light, with predicted multiple scattering, or by path tracing.
+    """Draw lit smoke by a ray march towards each light, with predicted multiple scattering.
 
-    Without --light, --point and --sky the lights of the scene are used, or else one from 1,1,1. The march replaces a
-    sky by twelve lights, and draws a scene's obstacles with their shadows. Path tracing is unbiased and prints its
-    noise; obstacles then absorb all light, fire emits grey light, and the background is black or the sky.
+    Without --light, --point and --sky the lights of the scene are used, or else one from 1,1,1. Twelve lights stand for
+    a sky. A scene's obstacles are drawn with their shadows.
     """
-    if samples is not None and background is not None:
-        raise WlmError("--background cannot be used with --samples: behind traced smoke is only --sky")
     colour, around = _given_albedo(albedo), None if sky is None else vector("--sky", sky)
     behind = around if background is None else vector("--background", background)
     check_white(white)
     own, twelve = parse_lights(lights, points, around)
     console.quiet_warp()
     from wlm.formats.exr import write_exr
-    from wlm.smoke.scene import obstacle_mesh
     from wlm.smoke.shading import Light
     from wlm.smoke.transport.lighting import LitSmoke, light_smoke
     from wlm.smoke.transport.orders import ScatteredSmoke, orders_march, scatter
-    from wlm.smoke.transport.tracing import HIGHEST, trace
     from wlm.view.pictures import contact_sheet, save_png, to_bytes
     from wlm.view.smoke import picture
 
@@ -261,35 +251,24 @@ def light(
         colour = colour or frames.scene.smoke.albedo
     if not own and around is None:
         own = [Light((1.0, 1.0, 1.0))] if frames.scene is None else [each.light() for each in frames.scene.lights]
-    colour, highest = colour or (1.0, 1.0, 1.0), 1 if orders == "single" else HIGHEST
+    colour = colour or (1.0, 1.0, 1.0)
     file = outputs(smoke, frames.single, output, "light", ".png", ".exr")
-    rows = console.table(
-        str(smoke), ["file", "mean radiance", "largest", "pixels above white", *(["noise"] * (samples is not None))]
-    )
+    rows = console.table(str(smoke), ["file", "mean radiance", "largest", "pixels above white"])
     pictures, thickness = [], 0.0
     with console.running("light") as progress:
         for frame, volume in frames.volumes(progress=progress):
             console.note_warnings(volume.warnings)
             thickness = max(thickness, volume.thickness)
-            view, looks, noise = frames.view(camera, volume), frames.looks(frame), []
-            if samples is None:
-                march, lamps = orders_march(volume, g), [*own, *twelve]
-                if orders == "single":
-                    made: LitSmoke | ScatteredSmoke = light_smoke(volume, view, lamps, march)
-                else:
-                    made = scatter(volume, view, lamps, colour, march=march)
-                extra: dict[str, Any] = {} if looks is None else {"background": looks.background, "ramp": looks.ramp}
-                if looks is not None:
-                    extra |= {"obstacles": looks.obstacles, "time": looks.time}
-                image = picture(made, albedo=colour, **extra | ({} if behind is None else {"background": behind}))
+            view, looks = frames.view(camera, volume), frames.looks(frame)
+            march, lamps = orders_march(volume, g), [*own, *twelve]
+            if orders == "single":
+                made: LitSmoke | ScatteredSmoke = light_smoke(volume, view, lamps, march)
             else:
-                solid = None if looks is None else obstacle_mesh(looks.obstacles, looks.time)[:2]
-                paths: dict[str, Any] = {"sky": around, "albedo": colour, "g": g, "obstacles": solid}
-                try:
-                    traced = trace(volume, view, own, samples=samples, orders=0, highest=highest, **paths)
-                except WlmError as error:
-                    raise WlmError(f"{frames.file(frame)}: {error}") from error
-                image, noise = traced.total, [f"{traced.error:.2%}"]
+                made = scatter(volume, view, lamps, colour, march=march)
+            extra: dict[str, Any] = {} if looks is None else {"background": looks.background, "ramp": looks.ramp}
+            if looks is not None:
+                extra |= {"obstacles": looks.obstacles, "time": looks.time}
+            image = picture(made, albedo=colour, **extra | ({} if behind is None else {"background": behind}))
             path = file(frame)
             if path.suffix.lower() == ".exr":
                 write_exr(path, image.cpu().numpy())
@@ -297,7 +276,7 @@ def light(
                 pictures.append(to_bytes(image, white))
                 save_png(path, pictures[-1])
             clipped = float((image > white).any(-1).float().mean())
-            rows.add_row(escape(path.name), f"{image.mean():.4g}", f"{image.max():.4g}", f"{clipped:.1%}", *noise)
+            rows.add_row(escape(path.name), f"{image.mean():.4g}", f"{image.max():.4g}", f"{clipped:.1%}")
     if not frames.single:
         contact_sheet(output / SHEET, {"": pictures})
     console.show(rows)

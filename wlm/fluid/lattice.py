@@ -417,8 +417,7 @@ class Lattice:
             return
         self._prepare()
         self._begun = True
-        in_graphs = self.device.is_cuda and steps >= _GRAPH_FROM and len(self.slabs.parts) == 1
-        run = self._run_in_graphs if in_graphs else self._run
+        run = self._run_in_graphs if self.device.is_cuda and steps >= _GRAPH_FROM else self._run
         while steps > 0:
             chunk = min(steps, CHECK_EVERY - self._unchecked)
             self._require_slow(chunk)

@@ -18,8 +18,9 @@ from wlm.errors import WlmError
 from wlm.interop import free_memory
 from wlm_kernels.fluid.lattice_sets import Slab, launch_slab
 
-# Bytes below which an array is on the first device alone: memory is divided in pages of 2 MiB.
-_WHOLE = 1 << 22
+# Bytes below which an array is on the first device alone. What all cells read, such as marks of solids, must be divided
+# even if it is small: the memory of another device is not cached.
+_WHOLE = 1 << 16
 # Advice for the driver's cuMemAdvise: where pages are, and which devices map them there.
 _PREFERRED, _ACCESSED_BY = 3, 5
 
@@ -80,13 +81,7 @@ class Slabs:
 
     def each(self, compute: Callable[[Slab], None]) -> None:
         """Calls a function for each slab, which queues work on its device; this work begins after all earlier work, and
-        later work of the first device begins after it.
-
-        Raises:
-            ValueError: There are several GPUs, and a CUDA graph is captured.
-        """
-        if self._others and self.home.is_capturing:
-            raise ValueError(f"device: expected one GPU during the capture of a CUDA graph, got {self.name}")
+        later work of the first device begins after it, also in a CUDA graph that is captured on the first device."""
         for device in self._others:
             device.stream.wait_stream(self.home.stream)
         for slab in self.parts:

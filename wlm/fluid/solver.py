@@ -327,7 +327,7 @@ class Solver:
         self._done = 0
         # The settings of the last steps, and a graph of steps with them; None: these steps cannot be captured.
         graphs = self.device.is_cuda and substeps % lattice.period == 0 and wind is None
-        graphs = graphs and len(lattice.slabs.parts) == 1 and (self._pool is None or self._pool.is_full)
+        graphs = graphs and (self._pool is None or self._pool.is_full)
         self._captures: tuple[tuple, wp.Graph | None] | None = ((), None) if graphs else None
 
     # Running.

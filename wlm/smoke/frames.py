@@ -10,17 +10,12 @@ from wlm.fluid.volume import DensityVolume
 from wlm.interop import check_device, moved
 from wlm.smoke.camera import Camera
 from wlm.smoke.lightmaps import SixWay
-from wlm.smoke.march.six_way import bake, bake_coarse, coarse_march, with_surface
-from wlm.smoke.network.prediction import SmokePredictor
+from wlm.smoke.march.six_way import bake, with_surface
+from wlm.smoke.network.prediction import SmokePredictor, predict
 from wlm.smoke.scene import Looks
 from wlm.smoke.transport.sphere import bake_sphere
 
-
-def _coarse(volume: DensityVolume, camera: Camera, seed: int) -> SixWay:
-    return bake_coarse(volume, camera, coarse_march(volume, seed))
-
-
-_METHODS: dict[str, Callable[..., SixWay]] = {"bake": bake, "sphere": bake_sphere, "coarse": _coarse}
+_METHODS: dict[str, Callable[..., SixWay]] = {"bake": bake, "sphere": bake_sphere, "coarse": predict}
 
 
 class FrameMaker(Whole):

@@ -5,9 +5,9 @@ forward pass are decided as there, and each is differentiated as it is computed:
 
 - A trace is differentiated through both of its velocity reads. Along an axis on which it is clamped to a face its
   gradient is 0; where it is cut by a solid, the fraction of its length that remains is constant.
-- Where MacCormack's limiter clamps a value, the gradient goes to the cell with the smallest or largest of the eight
-  values alone, the first of equal ones, and none to the prediction, the correction or the velocity. Where smoke is
-  uniform, rounding decides whether a value is clamped.
+- Where MacCormack's limiter clamps a value, the gradient goes to the cell with the smallest of the eight values alone,
+  the first of equal ones; where it drops the correction, to the prediction alone. Where smoke is uniform, rounding
+  decides whether it does.
 - Clean air from beyond an open face has no gradient, and neither have solid cells.
 
 Values are float32. Gradients of neighbouring cells are summed in any order on CUDA.
@@ -203,21 +203,18 @@ def _corrected_backward(
     least = float(field[origin.base])
     most = float(least)
     i_least = int(origin.base)
-    i_most = int(origin.base)
     for k in range(1, 8):
         j = origin.base + wp.dot(side_of(k), origin.step)
         if field[j] < least:
             least = field[j]
             i_least = j
-        if field[j] > most:
-            most = field[j]
-            i_most = j
+        most = wp.max(most, field[j])
     value = predicted[i] + 0.5 * (field[i] - _interpolate(predicted, stencil(box.n, box.periodic, target.end)))
     if value < least:
         wp.atomic_add(on_field, i_least, g)
         return wp.vec3()
     if value > most:
-        wp.atomic_add(on_field, i_most, g)
+        wp.atomic_add(on_predicted, i, g)
         return wp.vec3()
     wp.atomic_add(on_predicted, i, g)
     wp.atomic_add(on_field, i, 0.5 * g)

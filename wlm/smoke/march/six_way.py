@@ -20,7 +20,7 @@ from wlm.smoke.lightmaps import SixWay, StepError
 from wlm.smoke.march.launch import run
 from wlm.smoke.scene import Looks
 from wlm_kernels.smoke import march_six, marches
-from wlm_kernels.smoke.settings import LEAST_STEP, March
+from wlm_kernels.smoke.settings import March
 
 _SURFACE = March(step=1.0, jitter=0.0)  # march for the depth at which obstacles and their shadows are drawn
 _STEPS = 130  # steps through the box of `coarse_march`
@@ -97,8 +97,9 @@ def bake_coarse(volume: DensityVolume, camera: Camera, march: March = March()) -
 
 
 def coarse_march(volume: DensityVolume, seed: int = 0) -> March:
-    """Returns settings of a march in steps of 1/130 of the smoke's longest edge (or a minimum), with a jitter seed."""
-    return March(max(max(volume.shape) / _STEPS, LEAST_STEP), seed=seed)
+    """Returns settings of a march in steps of 1/130 of the smoke's longest edge, but at least of a voxel: finer ones
+    take longer than `bake`. `seed` is that of the jitter."""
+    return March(max(max(volume.shape) / _STEPS, 1.0), seed=seed)
 
 
 def march_planes(volume: DensityVolume, camera: Camera, march: March) -> torch.Tensor:

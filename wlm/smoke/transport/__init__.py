@@ -1,4 +1,4 @@
-"""Lighting of smoke without six-way lightmaps: path tracing, lights from any direction, multiple scattering."""
+"""Lighting of smoke without six-way lightmaps: lights from any direction, multiple scattering."""
 
 from wlm._facade import facade
 

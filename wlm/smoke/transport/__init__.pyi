@@ -9,5 +9,3 @@ from wlm.smoke.transport.orders import ScatteredSmoke as ScatteredSmoke
 from wlm.smoke.transport.orders import load_orders as load_orders
 from wlm.smoke.transport.orders import scatter as scatter
 from wlm.smoke.transport.sphere import bake_sphere as bake_sphere
-from wlm.smoke.transport.tracing import Transport as Transport
-from wlm.smoke.transport.tracing import trace as trace

@@ -11,14 +11,13 @@ import numpy as np
 import torch
 import warp as wp
 
+from benchmarks import smoke_path
 from wlm.errors import WlmError
 from wlm.fluid.volume import DensityVolume
 from wlm.interop import device_name, free_memory, stream, to_warp
 from wlm.smoke.camera import Camera
 from wlm.smoke.march.launch import medium_of
 from wlm.smoke.shading import AnyLight, checked_albedo, checked_colour, in_voxels
-from wlm.system import Meter, OnProgress
-from wlm_kernels.smoke import path
 from wlm_kernels.smoke.march import View
 
 HIGHEST = 100_000
@@ -84,7 +83,6 @@ def trace(
     highest: int = HIGHEST,
     obstacles: tuple[np.ndarray, np.ndarray] | None = None,
     seed: int = 0,
-    progress: OnProgress | None = None,
 ) -> Transport:
     """Traces paths from the camera through the smoke.
 
@@ -100,7 +98,6 @@ def trace(
         highest: Number of scatterings after which a path ends; 1 is single scattering.
         obstacles: Corners [V, 3] in the world and triangles [F, 3] that absorb all light; None: none.
         seed: An integer of at least 0; the same seed gives the same result on one kind of device.
-        progress: Called after each of up to 16 parts of the paths.
 
     Returns:
         The light on the smoke's device.
@@ -126,11 +123,11 @@ def trace(
         densest = float(volume.density.max()) * medium.extinction
         if not densest <= _DENSEST:
             raise WlmError(f"smoke: expected optical depths of at most {_DENSEST:g} per voxel, found {densest:.4g}")
-        majorants = path.bounds(medium, densest)
-        lamps = path.make_lights([in_voxels(light, volume) for light in lights])
-        lamps = wp.array(lamps, dtype=path.PathLight, device=device)
+        majorants = smoke_path.bounds(medium, densest)
+        lamps = smoke_path.make_lights([in_voxels(light, volume) for light in lights])
+        lamps = wp.array(lamps, dtype=smoke_path.PathLight, device=device)
         mesh = None if obstacles is None or not len(obstacles[1]) else _mesh(obstacles, volume, device)
-        settings = path.PathSettings()
+        settings = smoke_path.PathSettings()
         settings.albedo, settings.g = wp.vec3(*map(float, colour)), float(g)
         settings.sky = wp.vec3(*map(float, checked_colour("sky", sky or (0.0, 0.0, 0.0))))
         settings.highest, settings.kept, settings.samples = min(highest, HIGHEST), orders, samples
@@ -143,17 +140,15 @@ def trace(
         _require(planes, sources, view, parts, at_once, device)
         total = torch.zeros((sources, kept, view.height, view.width, 3), device=volume.device)
         means = []
-        meter = Meter(progress, "trace", parts)
         for first in range(0, parts, at_once):
             count = min(at_once, parts - first)
             size = (count * planes, view.height, view.width, 3)
             out = torch.zeros(size, device=volume.device)
             arguments = (lamps, 0 if mesh is None else mesh.id, settings, first, parts)
-            path.trace(medium, view, majorants, *arguments, to_warp(out, wp.vec3))
+            smoke_path.trace(medium, view, majorants, *arguments, to_warp(out, wp.vec3))
             each = out.reshape(count, *total.shape)
             total += each.sum(0)
             means.append(each.sum(2))
-            meter.report(first + count)
         means = torch.cat(means)
         noise, total_noise = _noise(means, samples), _noise(means.sum(1), samples)
     names = [f"light {n + 1}" for n in range(len(lights))] + ["sky", "emission"]

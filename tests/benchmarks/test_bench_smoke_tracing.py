@@ -10,7 +10,9 @@ from reference.marching import Scene
 from reference.single_light import lit
 from reference.transport import scattered_twice
 
+from benchmarks import smoke_path
 from benchmarks.path_tracer import PathTracer
+from benchmarks.smoke_tracing import Transport, trace
 from demos.plume import make_plume
 from wlm.errors import WlmError
 from wlm.fluid.obstacles import surface
@@ -18,8 +20,6 @@ from wlm.fluid.volume import DensityVolume, from_array
 from wlm.smoke.march.launch import medium_of
 from wlm.smoke.march.six_way import bake
 from wlm.smoke.shading import Light, PointLight
-from wlm.smoke.transport.tracing import Transport, trace
-from wlm_kernels.smoke import path
 from wlm_kernels.smoke.march import BRICK
 
 WAY = (1.0, 0.7, 0.8)
@@ -163,9 +163,9 @@ def test_empty_bricks_around_smoke_are_left_out(device: str):
     large = DensityVolume(density, small.extinction, small.voxel, tuple(-small.voxel * n for n in (41, 3, 20)))
     made = [trace(volume, facing(small, size=8), [Light(WAY)], samples=512, orders=2) for volume in (small, large)]
     assert float(made[1].total.mean()) == pytest.approx(float(made[0].total.mean()), rel=0.02)
-    bounds = path.bounds(medium_of(large), 2 * BRICK)
+    bounds = smoke_path.bounds(medium_of(large), 2 * BRICK)
     assert bounds.low == (40, 0, 16) and bounds.size == (24, 24, 32) and bounds.most.shape == (3, 3, 4)
-    assert path.bounds(medium_of(from_array(np.zeros((9, 9, 9)), device=device)), 1.0).most.shape == (1, 1, 1)
+    assert smoke_path.bounds(medium_of(from_array(np.zeros((9, 9, 9)), device=device)), 1.0).most.shape == (1, 1, 1)
 
 
 def test_the_noise_of_all_lights_counts_what_they_share(device: str):
@@ -180,7 +180,9 @@ def test_the_noise_of_all_lights_counts_what_they_share(device: str):
     assert alone.error == math.inf and torch.isfinite(alone.total).all() and alone.total.any()
 
 
-def test_planes_beyond_the_memory_are_refused_before_they_are_made():
+def test_smoke_too_dense_and_planes_beyond_the_memory_are_refused_at_once():
+    with pytest.raises(WlmError, match=r"smoke: expected optical depths of at most 10000 per voxel"):
+        trace(ball(4, depth=1e9), facing(ball(4), size=2), [Light(WAY)])
     volume = ball(4)
     with pytest.raises(WlmError, match=r"orders: .* planes of 16384 x 16384 pixels need .* fewer orders or pixels"):
         trace(volume, facing(volume, size=16384), [Light(WAY)], samples=2, orders=1000)
