@@ -113,6 +113,8 @@ PLOTS: dict[str, Lines] = {
         "bpp",
         {
             "ours": _city("ours .*"),
+            "ours, L, M64 and H": _city("ours (L|M64|H)", "nvidia-h100"),
+            "the paper's M": _city("ours M-paper", "nvidia-h100"),
             "NTC": _city("NTC .*"),
             "ASTC": _city("ASTC .*", "cpu"),
             "BC7": _city("BC7", "cpu"),
@@ -121,11 +123,12 @@ PLOTS: dict[str, Lines] = {
         },
     ),
     "bench-probe-livingroom.png": Lines(
-        "light probes of a living room at noon (ours: --error absolute)",
+        "light probes of a living room at noon",
         "bpp",
         {
-            "ours, PCA": _room("PCA, absolute"),
-            "ours, Gaussians": _room("Gaussians, absolute", "nvidia-h100"),
+            "ours, paper and standard": Curve("nvidia-h200", "probe", "livingroom 12.00", "ours (paper|standard)"),
+            "ours, PCA, absolute": _room("PCA, absolute"),
+            "ours, Gaussians, absolute": _room("Gaussians, absolute", "nvidia-h100"),
             "CPCA by signal": _room("CPCA by signal"),
             "clustered PCA": _room("clustered PCA"),
             "moving basis": _room("moving basis"),

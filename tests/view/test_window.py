@@ -167,7 +167,10 @@ def test_atlases_of_each_method(kind, tmp_path, show):
     if kind == "cascade":
         assert window.scene.views == ("light",)
         return
+    title = window.canvas.renderers[0].actors["title"]
+    assert title.GetText(title.UpperEdge) == "decoded"
     window.choose("tiles")
+    assert title.GetText(title.UpperEdge) == "tiles"
     assert np.abs(np.split(scene_of(window)[40:], 3, axis=1)[0] - decoded).max() > 20
 
 

@@ -106,8 +106,10 @@ class Window:
         """Redraws everything for the current state."""
         self.scene.draw(self.canvas, self.state)
         self._lay_out()
-        views = self.scene.views
-        chosen = "   ".join(f"[{i} {v}]" if v == self.state.view else f"{i} {v}" for i, v in enumerate(views, 1))
+        panels, views, view = self.scene.panels, self.scene.views, self.state.view
+        if len(panels) > 1:
+            self.canvas.renderers[0].actors["title"].set_text("upper_edge", panels[0] if view == views[0] else view)
+        chosen = "   ".join(f"[{i} {v}]" if v == view else f"{i} {v}" for i, v in enumerate(views, 1))
         parts = [f"view: {chosen}" if len(views) > 1 else "", self.scene.caption(self.state)]
         self._texts["caption"].SetInput("      ".join(filter(None, parts)))
         # Keys have no effect in a picture.
@@ -149,14 +151,12 @@ class Window:
             plotter.subplot(0, number)
             plotter.set_background(_BACKGROUND, all_renderers=False)
             if len(self.scene.panels) > 1:
-                plotter.add_text(title, position="upper_edge", font_size=_TITLE_FONT, color=_INK)
+                plotter.add_text(title, position="upper_edge", font_size=_TITLE_FONT, color=_INK, name="title")
         plotter.subplot(1, 0)
         plotter.set_background(_STRIP, all_renderers=False)
 
         def text(name: str, x: float, y: float) -> Any:
-            return plotter.add_text(
-                "", position=(x, y), viewport=True, font_size=_FONT, color=_INK, name=name, font="arial"
-            )
+            return plotter.add_text("", position=(x, y), viewport=True, font_size=_FONT, color=_INK, name=name)
 
         self._texts = {"caption": text("caption", _INDENT, _CAPTION), "keys": text("keys", _INDENT, _KEYS)}
         colour = need("pyvista", "view").Color
