@@ -115,7 +115,7 @@ def test_lightmaps_decode_as_in_python(model, tmp_path, show, unpacked, interpol
     ("unpacked", "interpolation"), [_long(False, "radiance"), (True, "radiance"), _long(True, "network")]
 )
 def test_frames_of_all_modes_decode_as_in_python(tmp_path, show, unpacked, interpolation):
-    model = random_model((4, 4, 3, 4, 1, 4), times=(0.0, 7.5, 19.0), interpolation=interpolation)
+    model = random_model((4, 4, 1, 4, 1, 4), times=(0.0, 7.5, 19.0), interpolation=interpolation)
     model.save(tmp_path / "frames.wlm")
     write_page(tmp_path / "page.html", [tmp_path / "frames.wlm"])
     page = show(tmp_path / "page.html", unpacked=unpacked)
