@@ -6,7 +6,6 @@ from wlm.fluid.forcing import Wind as Wind
 from wlm.fluid.gradients import DifferentiableLattice as DifferentiableLattice
 from wlm.fluid.gradients import DifferentiableSolver as DifferentiableSolver
 from wlm.fluid.gradients import SmokeState as SmokeState
-from wlm.fluid.lattice import Domain as Domain
 from wlm.fluid.lattice import Lattice as Lattice
 from wlm.fluid.obstacles import Mesh as Mesh
 from wlm.fluid.obstacles import Obstacle as Obstacle
@@ -17,6 +16,7 @@ from wlm.fluid.solver import Buoyancy as Buoyancy
 from wlm.fluid.solver import Noise as Noise
 from wlm.fluid.solver import Solver as Solver
 from wlm.fluid.solver import Source as Source
+from wlm.fluid.units import Domain as Domain
 from wlm.fluid.volume import DensityVolume as DensityVolume
 from wlm.fluid.volume import from_array as from_array
 from wlm.fluid.volume import load_volume as load_volume

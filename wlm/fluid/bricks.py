@@ -12,7 +12,6 @@ import torch
 import warp as wp
 
 from wlm.errors import WlmError
-from wlm.fluid.lattice import require_free
 from wlm.fluid.slabs import Slabs
 from wlm_kernels.fluid import advection_places, advection_sources
 from wlm_kernels.fluid.advection import Fields
@@ -30,7 +29,7 @@ def require_memory(name: str, shape: tuple[int, int, int], needed: int, slabs: S
     if x * y * z >= 2**31:
         raise WlmError(f"{name}: {x} x {y} x {z} cells: expected fewer than 2^31 cells in all: use a lower refinement")
     remedy = "a lower refinement, bricks, storage='float16' or the scheme 'semi-lagrangian'"
-    require_free(name, shape, needed, slabs, remedy)
+    slabs.require(name, shape, needed, remedy)
 
 
 class BrickPool:

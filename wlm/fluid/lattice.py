@@ -44,47 +44,6 @@ _GRAPH_STEPS, _GRAPH_FROM = 8, 16
 _STALE = 3
 
 
-@dataclass(frozen=True)
-class Domain:
-    """Converts SI units to units of a lattice.
-
-    Attributes:
-        cell: Edge of a cell in metres.
-        step: Duration of a step in seconds.
-    """
-
-    cell: float
-    step: float
-
-    def __post_init__(self) -> None:
-        for name in ("cell", "step"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0.0):
-                raise ValueError(f"{name}: expected a positive number, got {value}")
-
-    def speed(self, value: float) -> float:
-        """Converts a speed from m/s to cells per step."""
-        return value * self.step / self.cell
-
-    def viscosity(self, value: float) -> float:
-        """Converts a kinematic viscosity from m^2/s to square cells per step."""
-        return value * self.step / self.cell**2
-
-    def acceleration(self, value: float) -> float:
-        """Converts an acceleration from m/s^2 to cells per step squared."""
-        return value * self.step**2 / self.cell
-
-
-def require_free(name: str, shape: tuple[int, int, int], needed: int, slabs: Slabs, remedy: str) -> None:
-    """Checks that `needed` bytes for a grid are free; `name` and `remedy` are words for the error message."""
-    if needed > (free := slabs.free):
-        cells = " x ".join(map(str, shape))
-        raise WlmError(
-            f"{name}: {cells} cells need {needed / 2**30:.1f} GiB on {slabs.name}: expected at most the"
-            f" {free / 2**30:.1f} GiB that are free: use {remedy}"
-        )
-
-
 @dataclass(frozen=True, eq=False)
 class Setup:
     """The settings of a lattice of N cells, with copies of its L links, solids and force, for `wlm.fluid.gradients`.
@@ -188,7 +147,7 @@ class Lattice:
         self.device = self.slabs.home
         spec = Spec(lattice, storage, eddies=smagorinsky > 0.0)
         needed = self.bytes_needed(self.shape, storage, lattice)
-        require_free("lattice", self.shape, needed, self.slabs, "fewer cells or storage='float16'")
+        self.slabs.require("lattice", self.shape, needed, "fewer cells or storage='float16'")
         self._n, self._cells = wp.vec3i(*self.shape), math.prod(self.shape)
         self._set, self._tables = velocity_set(lattice), tables(lattice, str(self.device))
         size = (len(self._set.c), self._cells)

@@ -68,6 +68,15 @@ class Slabs:
             planes[str(slab.device)] += slab.end - slab.begin
         return min(free_memory(wp.get_device(name)) * self._n[0] // count for name, count in planes.items())
 
+    def require(self, name: str, shape: tuple[int, int, int], needed: int, remedy: str) -> None:
+        """Checks that `needed` bytes for a grid are free; `name` and `remedy` are words for the error message."""
+        if needed > (free := self.free):
+            cells = " x ".join(map(str, shape))
+            raise WlmError(
+                f"{name}: {cells} cells need {needed / 2**30:.1f} GiB on {self.name}: expected at most the"
+                f" {free / 2**30:.1f} GiB that are free: use {remedy}"
+            )
+
     def zeros(self, shape: int | tuple[int, ...], dtype: Any) -> wp.array:
         """Makes an array of zeros whose last or only axis, or whose first three axes, are cells: if it has two axes,
         the first is of rows that are divided one by one."""

@@ -704,14 +704,17 @@ class Solver:
     def _carry(self) -> None:
         air = [self._box, self._velocity.flatten(), self.substeps, self._traces]
         decays, where = (self._decay, (1.0, 1.0)), [self._box, self._traces, self._walls[0]]
+        bricks = self._bricks
+        if self._pool is not None:
+            self._on_slabs(advection_places.trace, *air, bricks)
         for decay, buffers in zip(decays, zip(*map(self._carried, self._fields), strict=True), strict=False):
             now, predicted, out = buffers[0], buffers[1], buffers[-1]
-            bricks = self._bricks
             if self._pool is None:
+                # Smoke and fuel are in other places, and so are their traces.
                 bricks = self._near
                 self._on_slabs(advection.mark_smoke, self._box, now, bricks)
                 advection_places.choose(self._box, bricks)
-            self._on_slabs(advection_places.trace, *air, bricks)
+                self._on_slabs(advection_places.trace, *air, bricks)
             if self.scheme == "maccormack":
                 self._on_slabs(advection.advect, *where, now, predicted, bricks=bricks)
                 self._on_slabs(advection.advect, *where, now, out, decay, bricks, predicted)

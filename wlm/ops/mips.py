@@ -84,4 +84,6 @@ class Read(torch.autograd.Function):
                 level=None if level is None else to_warp(level),
                 **ctx.mode,
             )
-        return None if on_stacks is None else on_stacks.sum(-1), None, None, on_uv, on_level, None, None
+        if on_stacks is not None:
+            on_stacks = on_stacks.sum(-1) if copies > 1 else on_stacks.squeeze(-1)  # a sum of one would be a copy
+        return on_stacks, None, None, on_uv, on_level, None, None

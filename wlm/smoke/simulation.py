@@ -16,9 +16,10 @@ from wlm.fluid.black_body import black_body_light
 from wlm.fluid.bricks import require_memory
 from wlm.fluid.faces import FACES
 from wlm.fluid.forcing import EDDY
-from wlm.fluid.lattice import Domain, Lattice
+from wlm.fluid.lattice import Lattice
 from wlm.fluid.obstacles import SHELL, Mesh, Obstacle, Sphere, Trajectory
 from wlm.fluid.slabs import Slabs
+from wlm.fluid.units import Domain
 from wlm.fluid.volume import DensityVolume, save_bricks, save_volume
 from wlm.formats.checkpoint import EVERY, Pace
 from wlm.formats.lock import locked

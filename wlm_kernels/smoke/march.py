@@ -204,9 +204,9 @@ def in_tiles(height: int, width: int) -> tuple[int, int, int]:
 
 
 @wp.func
-def pixel_of(a: int, b: int, lane: int) -> wp.vec2i:
+def pixel_of(a: int, b: int, lane: int):
     """Returns the row and the column of a thread of an `in_tiles` launch, which may lie outside the image."""
-    return wp.vec2i(4 * a + lane // 8, 8 * b + lane % 8)
+    return 4 * a + lane // 8, 8 * b + lane % 8
 
 
 @wp.func

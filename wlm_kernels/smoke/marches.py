@@ -68,9 +68,7 @@ def _guide(smoke_type: Any, from_lattice: bool) -> wp.Kernel:
         out: wp.array3d[float],
     ):
         a, b, lane = wp.tid()
-        pixel = pixel_of(a, b, lane)
-        row = pixel[0]
-        column = pixel[1]
+        row, column = pixel_of(a, b, lane)
         if row >= view.height or column >= view.width:
             return
         random = wp.rand_init(march.seed, row * view.width + column)
@@ -154,9 +152,7 @@ def _coarse(smoke_type: Any, hot: bool) -> wp.Kernel:
         out: wp.array3d[float],
     ):
         a, b, lane = wp.tid()
-        pixel = pixel_of(a, b, lane)
-        row = pixel[0]
-        column = pixel[1]
+        row, column = pixel_of(a, b, lane)
         if row >= view.height or column >= view.width:
             return
         r = begin_jittered(view, row, column, smoke, march)
@@ -245,9 +241,7 @@ def _light(smoke_type: Any) -> wp.Kernel:
         out: wp.array3d[float],
     ):
         a, b, lane = wp.tid()
-        pixel = pixel_of(a, b, lane)
-        row = pixel[0]
-        column = pixel[1]
+        row, column = pixel_of(a, b, lane)
         if row >= view.height or column >= view.width:
             return
         r = begin_jittered(view, row, column, smoke, march)
@@ -288,9 +282,7 @@ def _unlit(smoke_type: Any) -> wp.Kernel:
         out: wp.array3d[float],
     ):
         a, b, lane = wp.tid()
-        pixel = pixel_of(a, b, lane)
-        row = pixel[0]
-        column = pixel[1]
+        row, column = pixel_of(a, b, lane)
         if row >= view.height or column >= view.width:
             return
         r = begin_jittered(view, row, column, smoke, march)
@@ -346,9 +338,7 @@ def _motion(smoke_type: Any) -> wp.Kernel:
         out: wp.array3d[float],
     ):
         a, b, lane = wp.tid()
-        pixel = pixel_of(a, b, lane)
-        row = pixel[0]
-        column = pixel[1]
+        row, column = pixel_of(a, b, lane)
         if row >= view.height or column >= view.width:
             return
         r = begin(view, row, column, smoke, march.step, 0.5)
