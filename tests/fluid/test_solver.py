@@ -15,7 +15,7 @@ from wlm.fluid.faces import FACES
 from wlm.fluid.lattice import CHECK_EVERY, Lattice
 from wlm.fluid.obstacles import Sphere, Trajectory, box_mesh, surface
 from wlm.fluid.slabs import Slabs
-from wlm.fluid.solver import Buoyancy, SCHEMES, Solver, Source, bytes_needed
+from wlm.fluid.solver import SCHEMES, Buoyancy, Solver, Source, bytes_needed
 
 SHAPE = (20, 10, 10)
 NOZZLE = Source("box", (2, 5, 5), (1.5, 2.5, 2.5), 1.0, 0.5, fixed=True)
