@@ -68,6 +68,7 @@ class Graphics {
       else if (type === gl.FLOAT_VEC3) gl.uniform3fv(place, value);
       else if (type === gl.FLOAT_VEC4) gl.uniform4fv(place, value);
       else if (type === gl.INT_VEC2) gl.uniform2iv(place, value);
+      else if (type === gl.INT_VEC3) gl.uniform3iv(place, value);
       else if (type === gl.FLOAT) gl.uniform1f(place, value);
       else gl.uniform1i(place, value);
     }
