@@ -34,6 +34,13 @@ Lights = Annotated[
         help="Light, repeatable: direction from the smoke to it, and irradiance, one number or three; default 4 pi.",
     ),
 ]
+Network = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE",
+        help='Network for six-way lightmaps, "fast" or a file of wlm smoke train; default a coarse march.',
+    ),
+]
 VolumeSettings = Annotated[
     list[str] | None,
     typer.Option(

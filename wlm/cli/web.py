@@ -8,7 +8,7 @@ from rich.markup import escape
 
 from wlm.cli.console import check_output, quiet_warp, running, show, table
 from wlm.cli.options import Key, Original, SceneFile, Time, Up, output_option
-from wlm.cli.smoke_options import VolumeSettings, parse_volume
+from wlm.cli.smoke_options import Network, VolumeSettings, parse_volume
 from wlm.errors import WlmError
 
 
@@ -19,7 +19,8 @@ def web(
         typer.Argument(
             metavar="[FILE...]",
             help="A .wlm of lightmaps, meshes or probes; six-way lightmaps (.exr, one per frame, or a folder); smoke "
-            "(.npz, .nvdb or .vdb, or a folder of frames), lit in the browser; or a scene (.yaml). Without a file, the page is a viewer that opens such files in the browser.",
+            "(.npz, .nvdb or .vdb, or a folder of frames), lit in the browser; or a scene (.yaml). Without a file, the "
+            "page is a viewer that opens such files in the browser, but for scenes and smoke.",
         ),
     ] = None,
     mesh: SceneFile = None,
@@ -30,14 +31,7 @@ def web(
         int, typer.Option(min=1, help="Most original lightmaps in the page, evenly spread over the times.")
     ] = 6,
     rate: Annotated[float, typer.Option(help="Frames per second at which smoke is played.")] = 30.0,
-    network: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help='Network by which the browser lights smoke: a file of wlm smoke train, or "fast", which ships with wlm; '
-            "default a coarse march.",
-        ),
-    ] = None,
+    network: Network = None,
     volume: VolumeSettings = None,
     up: Up = "y",
 ) -> None:

@@ -15,7 +15,7 @@ def content_of(files: Sequence[str | os.PathLike[str]]) -> tuple[str, list[Path]
     """Finds the kind of content of one file or folder, or of six-way lightmaps of smoke, one EXR a frame.
 
     Returns the kind, and the files; a folder of six-way lightmaps is replaced by its files. The kind is the system of a
-    model ("lightmap", "atlas", "probe" or "smoke"); "six-way"; "volume", also of a folder of volumes; "folder", any other
+    model ("lightmap", "atlas", "probe" or "smoke"); "six-way"; "volume", or a folder of volumes; "folder", any other
     one; or another kind of `wlm.inspection.files.kind_of`, such as "settings".
     """
     paths = [Path(file) for file in files]

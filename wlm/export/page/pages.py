@@ -54,7 +54,8 @@ def make_page(
 
     Args:
         files: One `.wlm` of lightmaps over time, lightmaps of meshes or probes; six-way lightmaps of smoke, one EXR a
-            frame, or their folder; a volume of smoke, or a folder of frames; or the YAML file of a scene, see `wlm.scene.load`.
+            frame, or their folder; volumes of smoke, one file or a folder of frames; or the YAML file of a scene, see
+            `wlm.scene.load`.
         mesh: Mesh file of the scene. To show lightmaps over time, it must have the UVs of the lightmaps.
         original: The input that was compressed, to compare with: a lightmap set, a lightmap, or a probe file.
         key: Name of the array to read from an original probe file with several arrays.

@@ -12,11 +12,10 @@ import numpy as np
 from wlm.errors import WlmError
 from wlm.export.page.html import Page, asset
 from wlm.smoke.camera import DIRECTIONS
-from wlm.smoke.codec import encode, open_network
+from wlm.smoke.codec import open_network
 from wlm.smoke.data import load_frames, read_six_way
 from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.march.six_way import coarse_march
-from wlm.smoke.model import SmokeModel
 from wlm.system import Meter, OnProgress
 
 _WHITE = 0.8  # screen value of the brightest lightmap
@@ -62,6 +61,8 @@ def live_page(
     `wlm.smoke.predict` does, from all sides; the options are those of `wlm.export.make_page`."""
     _check_rate(rate)
     model = None if network is None else open_network(network)
+    if model is not None and model.settings.guide != "six":
+        raise WlmError(f"{network}: network.guide: expected six for a page, found {model.settings.guide}")
     frames, arrays, entries = load_frames(paths[0], **dict(volume or {})), dict[str, np.ndarray](), list[dict]()
     for i, (_, smoke) in enumerate(frames.volumes(progress=progress)):
         march = coarse_march(smoke) if model is None else model.dataset.look(smoke.shape)
@@ -78,23 +79,13 @@ def live_page(
             raise WlmError(f"{frames.path}: expected at most {_MOST_BYTES >> 20} MiB of volumes, as half floats")
     live: dict[str, Any] = {"frames": entries, "network": None}
     if model is not None:
-        live["network"], arrays["weights"] = pack_network(model)
+        bundle = model.bundle()
+        live["network"], arrays["weights"] = bundle.document, bundle.buffers["weights"]
     figures = [("frames", f"{len(entries)}"), ("voxels of the last", " × ".join(map(str, smoke.shape)))]
     figures.append(("its optical thickness", f"{smoke.thickness:.3g}"))
     note = " ".join(["Six-way lightmaps, computed as you turn the smoke.", *frames.warnings, *smoke.warnings])
     manifest = {"smoke": {"frames": len(entries), "rate": rate}, "live": live}
     return Page("smoke", frames.path.stem, note, figures, manifest, arrays, [asset("live.js")])
-
-
-def pack_network(model: SmokeModel) -> tuple[dict[str, Any], np.ndarray]:
-    """Returns a network for `live.js`: its settings, the names of its planes and the shapes of its weights, and all
-    weights, one after the other, as half floats."""
-    if model.settings.guide != "six":
-        raise WlmError(f"network.guide: expected six, which scripts compute, found {model.settings.guide}")
-    settings, weights, _ = encode(model)
-    shapes = {name: weight.shape for name, weight in weights.items()}
-    head = {"settings": settings["network"], "names": model.network.names, "shapes": shapes}
-    return head, np.concatenate([weight.ravel() for weight in weights.values()])
 
 
 def _check_rate(rate: float) -> None:

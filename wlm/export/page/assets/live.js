@@ -429,7 +429,7 @@ class LiveSmoke {
     };
     const sums = this.#sums(common, volume);
     gl.disable(gl.DEPTH_TEST);
-    const radius = 0.5 * Math.hypot(...shape), ahead = dot(shape.map((n, i) => 0.5 * n - middle[i]), forward);
+    const radius = 0.5 * Math.hypot(...shape), ahead = forward.reduce((sum, a, i) => sum + a * (0.5 * shape[i] - middle[i]), 0);
     const guideOf = (name, size, apart, jitter, seed) => {
       const [u_sides, u_rest, u_surface] = this.#pass(MARCH, this.#target(name, ...size, {count: 3}), {
         ...common, u_sums: sums, u_heat: volume.fields.heat ?? volume.fields.density, u_size: size, u_step: [march.step, jitter, march.cutoff], u_seed: seed,
