@@ -174,7 +174,7 @@ def _check_solids(name: str, scene: Scene, volume: DensityVolume, at: float) -> 
     density = volume.density.cpu().numpy()
     for obstacle in scene.obstacles:
         # The obstacle's position is up to one step older, and a cell counts as inside by its centre.
-        slack = 1.5 * scene.grid.cell + obstacle.fastest() * scene.step * scene.smoke.substeps
+        slack = 1.5 * scene.grid.cell + obstacle.fastest * scene.step * scene.smoke.substeps
         inside = np.linalg.norm(places - obstacle.eased.at(at), axis=-1) < obstacle.radius - slack
         if density[inside].any():
             raise WlmError(f"demo: {name}: expected no smoke in an obstacle, got {density[inside].max():.3g}")

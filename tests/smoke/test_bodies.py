@@ -191,7 +191,7 @@ def test_a_body_turns_as_its_rows_say():
         np.testing.assert_allclose(body.eased.turn(time), turned, atol=1e-9)
     points = obstacle_mesh([body], 3.25)[0]
     np.testing.assert_allclose((points.min(0), points.max(0)), ((0.9, 2.0, 2.9), (1.1, 2.6, 3.1)), atol=1e-5)
-    assert body.fastest() == pytest.approx(2 * np.pi * math.hypot(0.6, 0.1, 0.1), rel=1e-6)
+    assert body.fastest == pytest.approx(2 * np.pi * math.hypot(0.6, 0.1, 0.1), rel=1e-6)
     angles = [Rotation.from_matrix(body.eased.turn(time)).magnitude() for time in (0.8, 0.86, 0.87, 1.0)]
     assert angles[0] == 0.0 < angles[2] - angles[1] < 0.2 * 2 * np.pi * 0.01 and angles[3] > 0.1
     both = ObstacleSettings(radius=0.1, path=((0, 0, 0, 0), (2, 2, 0, 0)), turn=((0, 90, 0, 0), (1, 90, 30, 40)))

@@ -269,7 +269,7 @@ def test_an_obstacle_on_its_path():
     there = ObstacleSettings(radius=1.0, path=((1.0, 0, 0, 0), (3.0, 4, 0, 0), (4.0, 4, 2, 0)))
     for time, centre in ((0.0, (0, 0, 0)), (2.0, (2, 0, 0)), (3.5, (4, 1, 0)), (9.0, (4, 2, 0))):
         np.testing.assert_allclose(there.eased.at(time), centre)
-    assert there.fastest() == 2.0 and ObstacleSettings(radius=1.0, path=((0.0, 1, 2, 3),)).fastest() == 0.0
+    assert there.fastest == 2.0 and ObstacleSettings(radius=1.0, path=((0.0, 1, 2, 3),)).fastest == 0.0
     with pytest.raises(ValidationError):
         ObstacleSettings(radius=(1.0, 1.0, 1.0), path=((0.0, 0, 0, 0),))
 

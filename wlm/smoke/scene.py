@@ -310,9 +310,13 @@ class Body(_Settings):
         """The path with ramps; positions in metres, times in seconds."""
         return self._keyed.eased(2.0 * float(np.abs(self.bounds).max()))
 
-    def fastest(self, edge: float = 0.0) -> float:
-        """Returns the largest speed along the path in metres per second, of a body that turns on its surface, as it is
-        simulated in cells of an edge in metres."""
+    @property
+    def fastest(self) -> float:
+        """Largest speed along the path, of a body that turns on its surface, in metres per second."""
+        return self.fastest_in(0.0)
+
+    def fastest_in(self, edge: float) -> float:
+        """Returns `fastest` of the body as it is simulated in cells of an edge in metres."""
         speeds, spins = (np.linalg.norm(rates, axis=1) for rates in self._keyed.rates)
         reach = float(np.linalg.norm(self.mesh(edge)[0], axis=1).max()) if spins.any() else 0.0
         return float((speeds + reach * spins).max())
@@ -618,7 +622,7 @@ class Scene(_Settings):
         inlets = [float(np.linalg.norm(inlet.velocity)) for inlet in self.inlets]
         if self.air.wind is not None:
             inlets.append(self.air.wind.fastest)
-        return [*inlets, *(obstacle.fastest(self.grid.cell) for obstacle in self.obstacles)]
+        return [*inlets, *(obstacle.fastest_in(self.grid.cell) for obstacle in self.obstacles)]
 
     @property
     def _growth(self) -> float:
