@@ -283,7 +283,7 @@ def simulate(
                 try:
                     if last and progress is not None:
                         mass = float(values[0].sum(dtype=torch.float64)) * scene.grid.voxel**3
-                        meter.report(frame, smoke=mass, frame_s=time.perf_counter() - begin)
+                        meter.report(frame, **{"smoke_m³": mass, "frame_s": time.perf_counter() - begin})
                     elif meter.due(frame - 1):
                         meter.report(frame - 1)
                 except KeyboardInterrupt:
