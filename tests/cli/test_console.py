@@ -9,18 +9,12 @@ from wlm.cli.console import COMPILING
 SCRIPT = """
 import warp as wp
 from wlm.cli.console import quiet_warp
-
 @wp.kernel(module="unique")
-def one(a: wp.array(dtype=float)):
-    a[0] = 1.0
-
+def one(a: wp.array(dtype=float)): a[0] = 1.0
 @wp.kernel(module="unique")
-def two(a: wp.array(dtype=float)):
-    a[0] = 2.0
-
+def two(a: wp.array(dtype=float)): a[0] = 2.0
 quiet_warp()
-for kernel in (one, two):
-    wp.launch(kernel, 1, [wp.zeros(1, dtype=float, device="cpu")], device="cpu")
+for kernel in (one, two): wp.launch(kernel, 1, [wp.zeros(1, dtype=float, device="cpu")], device="cpu")
 """
 
 
