@@ -19,7 +19,6 @@ DATA = ROOT / "demos" / "data" / "cornell"
 COMMANDS = (
     ("compress", DATA, "-o", "room.wlm", "--steps", 10),
     ("web", "room.wlm", "-o", "room.html"),
-    ("web", "-o", "viewer.html"),
     ("export", "room.wlm", "-o", "kit", "--engine", "three"),
     ("smoke", "simulate", "fan", "-o", "fan", "--scale", 0.15, "--frames", 1),
     ("smoke", "predict", "fan", "-o", "six", "--resolution", 32, "--network", "fast"),
@@ -27,7 +26,7 @@ COMMANDS = (
 
 
 def run(*words: object, **options: object) -> str:
-    done = subprocess.run([str(word) for word in words], capture_output=True, text=True, check=False, **options)
+    done = subprocess.run([*map(str, words)], capture_output=True, text=True, **options)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
@@ -42,20 +41,17 @@ def test_a_wheel_works_outside_the_checkout(tmp_path):
     # Without isolation: an isolated build would download setuptools.
     run(sys.executable, "-m", "build", "--no-isolation", "--outdir", tmp_path, tmp_path / "source")
     (wheel,) = tmp_path.glob(f"wlm-{wlm.__version__}-*.whl")
-    with zipfile.ZipFile(wheel) as archive:
-        names = {name for name in archive.namelist() if ".dist-info/" not in name}
+    names = {name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name}
     assert names == {re.sub("^configs/", "wlm/configs/", name) for name in tracked}
     # The packages that the wheel requires are this environment's.
     run(sys.executable, "-m", "venv", tmp_path / "venv")
     (packages,) = (tmp_path / "venv").glob("lib/*/site-packages")
     (packages / "required.pth").write_text(sysconfig.get_path("purelib"))
     python = tmp_path / "venv" / "bin" / "python"
-    environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
     (tmp_path / "empty").mkdir()
-    here = {"cwd": tmp_path / "empty", "env": environment}
+    here = {"cwd": tmp_path / "empty", "env": {**os.environ, "PYTHONPATH": ""}}
     run(python, "-m", "pip", "install", "--no-deps", "--no-index", wheel, **here)
-    for package in ("wlm", "wlm_kernels"):
-        assert run(python, "-c", f"import {package}; print({package}.__file__)", **here).startswith(str(packages))
+    assert run(python, "-c", "import wlm; print(wlm.__file__)", **here).startswith(str(packages))
     for command in COMMANDS:
         assert run(tmp_path / "venv" / "bin" / "wlm", *command, **here)
 
