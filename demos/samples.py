@@ -2,8 +2,8 @@
 
     python -m demos.samples              # all of them, after a change of the kits or of the data
 
-`samples/room.wlm` are the room's lightmaps, compressed by `wlm compress demos/data/cornell`; probes are compressed here.
-The rest of the projects is written by hand.
+`samples/room.wlm` are the room's lightmaps, compressed by `wlm compress demos/data/cornell`; probes are compressed
+here. The rest of the projects is written by hand.
 """
 
 from __future__ import annotations

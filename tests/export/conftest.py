@@ -1,30 +1,26 @@
 """A browser for the pages, where one is installed."""
 
-import functools
-import http.server
 import os
-import shutil
-import threading
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 
-_PROGRAMS = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome")
-_OPTIONS = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
-_OPTIONS += ("--enable-unsafe-webgpu", "--use-webgpu-adapter=swiftshader")
+from demos import pictures
+from demos.pictures import SOFTWARE_GL
+from wlm.errors import WlmError
+
+_OPTIONS = (*SOFTWARE_GL, "--enable-unsafe-webgpu", "--use-webgpu-adapter=swiftshader")
 
 
 @pytest.fixture(scope="session")
 def browser():
     """Headless Chromium with WebGL2 and WebGPU in software."""
-    program = next(filter(None, map(shutil.which, _PROGRAMS)), None)
-    if program is None:
-        pytest.skip("no browser: install chromium-headless-shell, or chromium")
-    playwright = pytest.importorskip("playwright.sync_api")
-    with playwright.sync_playwright() as started:
-        opened = started.chromium.launch(executable_path=program, args=list(_OPTIONS))
-        yield opened
-        opened.close()
+    try:
+        with pictures.browser(Path(), _OPTIONS) as opened:
+            yield opened.chromium
+    except WlmError as error:
+        pytest.skip(str(error))
 
 
 @pytest.fixture
@@ -56,32 +52,8 @@ THREE = os.environ.get("WLM_THREE")
 
 @pytest.fixture
 def serve():
-    """Serves a folder, with three.js beside it, on this machine's loopback; gives its address."""
+    """Serves a folder, with three.js in its node_modules, on this machine's loopback; gives its address."""
     if not THREE:
         pytest.skip("WLM_THREE names no three.js: npm install three, and name its folder")
-    started = []
-
-    class Quiet(http.server.SimpleHTTPRequestHandler):
-        def log_message(self, *words: object) -> None:
-            """Says nothing."""
-
-        def do_GET(self) -> None:
-            """Chromium with a window asks for a page's icon, and calls its lack an error."""
-            if self.path == "/favicon.ico":
-                self.send_response(204)
-                self.end_headers()
-                return
-            super().do_GET()
-
-    def start(folder: Path) -> str:
-        (folder / "three").symlink_to(Path(THREE).resolve(), target_is_directory=True)
-        server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Quiet, directory=str(folder)))
-        thread = threading.Thread(target=server.serve_forever, daemon=True)
-        thread.start()
-        started.append((server, thread))
-        return f"http://127.0.0.1:{server.server_port}"
-
-    yield start
-    for server, thread in started:
-        server.shutdown()
-        thread.join()
+    with ExitStack() as started:
+        yield lambda folder: started.enter_context(pictures.serve(folder))

@@ -25,7 +25,6 @@ from wlm.lightmap.decode import Decoder
 from wlm.smoke.flipbook.reading import read_flipbook
 from wlm.texels import to_srgb
 
-PROJECTS = ("threejs", "godot", "unity", "unreal")
 GODOT = os.environ.get("WLM_GODOT")
 GODOT_PAGE = """<canvas id="canvas"></canvas><script src="index.js"></script><script>
 const canvas = document.getElementById('canvas');
@@ -41,7 +40,7 @@ def test_projects_are_those_that_the_command_writes(tmp_path):
     assert not stale, "run python -m demos.samples"
     folders = {path.parent for path in made if path.name == "bundle.json"}
     assert {path.relative_to(SAMPLES) for folder in folders for path in (SAMPLES / folder).iterdir()} <= made
-    for project in PROJECTS:
+    for project in ("threejs", "godot", "unity", "unreal"):
         files = (path for path in (SAMPLES / project).rglob("*") if path.is_file() and "node_modules" not in path.parts)
         assert sum(path.stat().st_size for path in files) <= 350_000
         assert "**Never run**" in (SAMPLES / project / "README.md").read_text()
@@ -75,8 +74,6 @@ def room_seen(hour, height, width):
 def test_three_shows_the_room(browser, serve, tmp_path):
     folder = tmp_path / "site"
     shutil.copytree(SAMPLES / "threejs", folder, ignore=shutil.ignore_patterns("node_modules"))
-    index = (folder / "index.html").read_text()
-    (folder / "index.html").write_text(index.replace("./node_modules/three/", "./three/"))
     page, errors = browser.new_page(viewport={"width": 160, "height": 100}), []
     page.on("pageerror", lambda error: errors.append(str(error)))
     page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
@@ -108,15 +105,11 @@ def test_godot_shows_what_python_does(browser, serve, tmp_path):
     shutil.make_archive(str(project), "zip", project)
     lines, page = [], browser.new_page()
     page.on("console", lambda message: lines.append(message.text))
-    page.goto(f"{serve(tmp_path)}/index.html")
-    for _ in range(900):
-        page.wait_for_timeout(100)
-        if "DONE" in lines:
-            break
+    with page.expect_console_message(lambda message: message.text == "DONE", timeout=120_000):
+        page.goto(f"{serve(tmp_path)}/index.html")
     page.close()
     # A project that the editor never opened has no list of classes.
-    errors = [line for line in lines if "ERROR" in line and "global script cache" not in line]
-    assert "DONE" in lines and not errors, [line[:200] for line in lines]
+    assert not [line for line in lines if "ERROR" in line and "global script cache" not in line]
     found = [base64.b64decode(line.split()[1]) for line in lines if line.startswith("FOUND")]
     *room, smoke = [np.frombuffer(each, np.uint8) / 255.0 for each in found]
     decoder = Decoder(wlm.load(ROOM))

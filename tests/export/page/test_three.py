@@ -23,8 +23,8 @@ from wlm.smoke.bundle import bundle
 
 _SIZE = 64
 _PAGE = """<!doctype html>
-<script type="importmap">{"imports": {"three": "/three/build/three.module.js", "three/addons/": "/three/examples/jsm/"}}
-</script>
+<script type="importmap">{"imports": {"three": "/node_modules/three/build/three.module.js",
+ "three/addons/": "/node_modules/three/examples/jsm/"}}</script>
 <script type="module">
 import * as THREE from 'three';
 import { KTX2Loader } from 'three/addons/loaders/KTX2Loader.js';
@@ -109,7 +109,7 @@ def test_three_shows_what_decode_gives(site, browser):
 
 _KIT_SIZE = 96
 _KIT_PAGE = """<!doctype html>
-<script type="importmap">{"imports": {"three": "/three/build/three.module.js"}}</script>
+<script type="importmap">{"imports": {"three": "/node_modules/three/build/three.module.js"}}</script>
 <script type="module">
 import * as THREE from 'three';
 const renderer = new THREE.WebGLRenderer(), size = SIZE;
@@ -238,8 +238,8 @@ def test_three_shows_an_atlas(kind, colour, tmp_path, browser, serve):
 
 
 _SCENE_PAGE = """<!doctype html>
-<script type="importmap">{"imports": {"three": "/three/build/three.module.js", "three/addons/": "/three/examples/jsm/"}}
-</script>
+<script type="importmap">{"imports": {"three": "/node_modules/three/build/three.module.js",
+ "three/addons/": "/node_modules/three/examples/jsm/"}}</script>
 <script type="module">
 import * as THREE from 'three';
 import { GLTFLoader } from 'three/addons/loaders/GLTFLoader.js';
@@ -294,7 +294,7 @@ def test_three_shows_each_object_its_part(uv_set, colour, tmp_path, browser, ser
 
 
 _SMOKE_PAGE = """<!doctype html>
-<script type="importmap">{"imports": {"three": "/three/build/three.module.js"}}</script>
+<script type="importmap">{"imports": {"three": "/node_modules/three/build/three.module.js"}}</script>
 <script type="module">
 import * as THREE from 'three';
 import { loadSmoke } from './smoke.js';

@@ -12,8 +12,8 @@ from wlm.probe.volume.update import update_bundle
 
 _SIZE = 16
 _PAGE = """<!doctype html>
-<script type="importmap">{"imports": {"three": "/three/build/three.webgpu.js", "three/webgpu":
-"/three/build/three.webgpu.js", "three/tsl": "/three/build/three.tsl.js"}}
+<script type="importmap">{"imports": {"three": "/node_modules/three/build/three.webgpu.js", "three/webgpu":
+"/node_modules/three/build/three.webgpu.js", "three/tsl": "/node_modules/three/build/three.tsl.js"}}
 </script>
 <script type="module">
 import * as THREE from 'three/webgpu';

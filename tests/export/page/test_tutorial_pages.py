@@ -27,8 +27,6 @@ def test_the_page_shows_light(name, tmp_path, monkeypatch, serve, browser):
         elif kind not in ("command", "python"):
             (tmp_path / kind).write_text(text, encoding="utf-8")
     address, page, errors = serve(tmp_path), browser.new_page(viewport={"width": 320, "height": 240}), []
-    (tmp_path / "node_modules").mkdir()
-    (tmp_path / "node_modules" / "three").symlink_to(tmp_path / "three")
     page.on("pageerror", lambda error: errors.append(str(error)))
     page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
     page.goto(f"{address}/index.html", wait_until="networkidle")
