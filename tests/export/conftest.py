@@ -57,3 +57,23 @@ def serve():
         pytest.skip("WLM_THREE names no three.js: npm install three, and name its folder")
     with ExitStack() as started:
         yield lambda folder: started.enter_context(pictures.serve(folder))
+
+
+@pytest.fixture
+def visit(browser, serve):
+    """Opens the page of a folder, served with three.js; at the end nothing has gone wrong in it."""
+    pages, errors = [], []
+
+    def opened(folder, ready="window.ready", **options):
+        page = browser.new_page(**options)
+        pages.append(page)
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
+        page.goto(f"{serve(folder)}/index.html", wait_until="networkidle")
+        page.wait_for_function(ready, timeout=20000)
+        return page
+
+    yield opened
+    for page in pages:
+        page.close()
+    assert not errors

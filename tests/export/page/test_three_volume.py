@@ -48,7 +48,7 @@ window.ready = true;
 """
 
 
-def test_three_lights_a_plane_from_the_volume(serve, browser, tmp_path):
+def test_three_lights_a_plane_from_the_volume(visit, tmp_path):
     """After a walk the pixels are what the volume of the same walk gives in Python."""
     random = np.random.default_rng(4)
     place = random.uniform(0.0, 6.0, (300, 3)) * [1.0, 0.3, 1.0]
@@ -62,14 +62,10 @@ def test_three_lights_a_plane_from_the_volume(serve, browser, tmp_path):
         volume_module(volume_glsl(27)) | {"index.html": _PAGE.replace("SIZE", str(_SIZE)).encode()}
     ).items():
         (tmp_path / name).write_bytes(content)
-    page, errors = browser.new_page(), []
-    page.on("pageerror", lambda error: errors.append(str(error)))
-    page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
-    page.goto(f"{serve(tmp_path)}/index.html")
-    page.wait_for_function("window.ready")
+    page = visit(tmp_path)
     side, centre = 4.0, np.array([3.0, 0.9, 3.0])
     drawn = page.evaluate(f"draw({made.reference['viewpoint'].tolist()}, {centre.tolist()}, {side})")
-    assert drawn["webgpu"] and not errors
+    assert drawn["webgpu"]
     pixels = np.array(drawn["pixels"], np.float32).reshape(_SIZE, _SIZE, 4)[..., :3]
     along = ((np.arange(_SIZE) + 0.5) / _SIZE - 0.5) * side
     z, x = np.meshgrid(along, along, indexing="ij")
