@@ -74,19 +74,13 @@ window.ready = true;
 )
 
 
-@pytest.fixture
-def site(tmp_path, visit):
-    """The grid of a model, and three.js with it."""
+def test_three_shows_what_decode_gives(tmp_path, visit):
+    """At the pixels of six planes: trilinear between the cells' centres, half a cell ahead along the normal."""
     model = random_model(seed=3)
     model.content.net[-27:-24] = 4.0  # biases of L0: light that is nowhere below 0
     export(model, tmp_path, "three", cells=8)
     (tmp_path / "index.html").write_text(_PAGE.replace("SIZE", str(_SIZE)))
-    return model, json.loads((tmp_path / "grid.json").read_text()), visit(tmp_path)
-
-
-def test_three_shows_what_decode_gives(site):
-    """At the pixels of six planes: trilinear between the cells' centres, half a cell ahead along the normal."""
-    model, info, page = site
+    info, page = json.loads((tmp_path / "grid.json").read_text()), visit(tmp_path)
     low, high = np.array(info["box"])
     count = np.array(info["resolution"])
     cell, side = (high - low) / count, 0.9 * float((high - low).min())

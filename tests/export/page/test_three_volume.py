@@ -58,9 +58,8 @@ def test_three_lights_a_plane_from_the_volume(visit, tmp_path):
     volume = Volume(place, model.decoder(position=place).light(place), live=model.live, budget=64, side=8)
     made = update_bundle(volume, model, frames=5)
     export(made, tmp_path, shader="wgsl")
-    for name, content in (
-        volume_module(volume_glsl(27)) | {"index.html": _PAGE.replace("SIZE", str(_SIZE)).encode()}
-    ).items():
+    files = volume_module(volume_glsl(27)) | {"index.html": _PAGE.replace("SIZE", str(_SIZE)).encode()}
+    for name, content in files.items():
         (tmp_path / name).write_bytes(content)
     page = visit(tmp_path)
     side, centre = 4.0, np.array([3.0, 0.9, 3.0])
