@@ -195,6 +195,13 @@ def serve(folder: Path) -> Iterator[str]:
         def log_message(self, *words: object) -> None:
             """Says nothing."""
 
+        def do_GET(self) -> None:
+            """Chromium with a window asks for a page's icon, and calls its lack an error."""
+            if self.path != "/favicon.ico":
+                return super().do_GET()
+            self.send_response(204)
+            return self.end_headers()
+
     server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Quiet, directory=str(folder)))
     threading.Thread(target=server.serve_forever, daemon=True).start()
     yield f"http://127.0.0.1:{server.server_port}"
