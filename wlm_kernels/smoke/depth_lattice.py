@@ -26,6 +26,7 @@ voxels."""
 _MOST_MARCHING = 2**24  # largest number of nodes of a point light, each of which marches separately
 _AT_ONCE = wp.constant(8)  # nodes of a line that a thread sums at a time
 _LEAST_SPACING = 0.25  # voxels between nodes
+_DEEPEST = wp.constant(60000.0)  # largest optical depth, within the range of half floats
 _ROUNDING = 1e-6  # relative excess of a part over the step that is tolerated, so that rounding adds no part
 
 _Several = wp.types.vector(length=int(_AT_ONCE), dtype=float)
@@ -54,8 +55,18 @@ def axis(lattice: Lattice, n: int) -> wp.vec3:
     return wp.vec3(lattice.axes[n, 0], lattice.axes[n, 1], lattice.axes[n, 2])
 
 
+@wp.func_native("return wp::half(a).u | (unsigned int)(wp::half(b).u) << 16u;")
+def _halves(a: float, b: float) -> int: ...
+
+
 @wp.func
-def depths_at(nodes: wp.array3d[wp.vec2], lattice: Lattice, p: wp.vec3) -> wp.vec2:
+def packed(ahead: float, behind: float) -> int:
+    """Returns two optical depths as half floats in a word, which `march.unpacked` reads."""
+    return _halves(wp.min(ahead, _DEEPEST), wp.min(behind, _DEEPEST))
+
+
+@wp.func
+def depths_at(nodes: wp.array3d[int], lattice: Lattice, p: wp.vec3) -> wp.vec2:
     """Interpolates optical depths to the light and to the opposite light trilinearly between nodes."""
     inverse = wp.vec3(1.0 / lattice.gap[0], 1.0 / lattice.gap[1], 1.0 / lattice.gap[2])
     return between_nodes(nodes, wp.cw_mul(lattice.axes * (p - lattice.origin) - lattice.low, inverse))
@@ -76,44 +87,35 @@ def _on_line(pair: int, line: int, n: int, k: int) -> wp.vec4i:
 @wp.kernel(module="unique", module_options=OPTIONS)
 def _add_up(
     # in:
-    gaps: wp.array4d[float],
+    gaps: wp.array4d[wp.float16],
     # out:
-    ahead: wp.array4d[float],
-    nodes: wp.array4d[wp.vec2],
+    nodes: wp.array4d[int],
 ):
     """Sums optical depths from each node of a line to both of its ends; the light is beyond the last node."""
     pair, line, k = wp.tid()
     last = wp.where(pair == 0, nodes.shape[1], nodes.shape[2]) - 1
     if line >= wp.where(pair == 0, nodes.shape[2], nodes.shape[1]):
         return
-    # Several nodes at a time, since loads wait for earlier stores. Both depths of a node are stored at once, so that
-    # neighbouring threads write whole stretches of memory.
-    total = float(0.0)
+    # In double precision, since the depth ahead is a difference. Several nodes at a time, since loads wait for earlier
+    # stores.
+    ahead = wp.float64(0.0)
+    for n in range(last):
+        q = _on_line(pair, line, n, k)
+        ahead += wp.float64(gaps[q[0], q[1], q[2], q[3]])
+    behind = wp.float64(0.0)
     for begin in range(0, last, _AT_ONCE):
         several = _Several()
-        for m in range(_AT_ONCE):
-            q = _on_line(pair, line, wp.max(last - 1 - begin - m, 0), k)
-            several[m] = gaps[q[0], q[1], q[2], q[3]]
-        for m in range(_AT_ONCE):
-            if begin + m < last:
-                total += several[m]
-                q = _on_line(pair, line, last - 1 - begin - m, k)
-                ahead[q[0], q[1], q[2], q[3]] = total
-    behind = float(0.0)
-    for begin in range(0, last, _AT_ONCE):
-        several = _Several()
-        to_end = _Several()
         for m in range(_AT_ONCE):
             q = _on_line(pair, line, wp.min(begin + m, last - 1), k)
-            several[m] = gaps[q[0], q[1], q[2], q[3]]
-            to_end[m] = ahead[q[0], q[1], q[2], q[3]]
+            several[m] = float(gaps[q[0], q[1], q[2], q[3]])
         for m in range(_AT_ONCE):
             if begin + m < last:
                 q = _on_line(pair, line, begin + m, k)
-                nodes[q[0], q[1], q[2], q[3]] = wp.vec2(to_end[m], behind)
-                behind += several[m]
+                nodes[q[0], q[1], q[2], q[3]] = packed(float(ahead), float(behind))
+                ahead -= wp.float64(several[m])
+                behind += wp.float64(several[m])
     q = _on_line(pair, line, last, k)
-    nodes[q[0], q[1], q[2], q[3]] = wp.vec2(0.0, behind)
+    nodes[q[0], q[1], q[2], q[3]] = packed(0.0, float(behind))
 
 
 @for_smoke
@@ -125,7 +127,7 @@ def _measure(smoke_type: Any, pairs: int) -> wp.Kernel:
         lattice: Lattice,
         parts: wp.vec2i,
         # out:
-        gaps: wp.array4d[float],
+        gaps: wp.array4d[wp.float16],
     ):
         """Computes the optical depth from a node to the next node along the axis of each pair of opposite lights."""
         i, j, k = wp.tid()
@@ -142,7 +144,7 @@ def _measure(smoke_type: Any, pairs: int) -> wp.Kernel:
                     low = wp.min(p) >= -0.5
                     if low and p[0] <= size[0] + 0.5 and p[1] <= size[1] + 0.5 and p[2] <= size[2] + 0.5:
                         tau += d * sample(smoke, p)
-            gaps[pair, i, j, k] = smoke.extinction * tau
+            gaps[pair, i, j, k] = wp.float16(wp.min(smoke.extinction * tau, _DEEPEST))
 
     return kernel
 
@@ -156,7 +158,7 @@ def _reach(smoke_type: Any) -> wp.Kernel:
         lattice: Lattice,
         step: float,
         # out:
-        nodes: wp.array3d[wp.vec2],
+        nodes: wp.array3d[int],
     ):
         i, j, k = wp.tid()
         p = _node(lattice, i, j, k)
@@ -171,7 +173,7 @@ def _reach(smoke_type: Any) -> wp.Kernel:
             d = (last - first) / float(count)
             for n in range(count):
                 tau += d * sample(smoke, p + (first + (float(n) + 0.5) * d) * toward)
-        nodes[i, j, k] = wp.vec2(smoke.extinction * tau, 0.0)
+        nodes[i, j, k] = packed(smoke.extinction * tau, 0.0)
 
     return kernel
 
@@ -217,11 +219,10 @@ def add_up(medium: Medium, lattice: Lattice, counts: Sequence[int], pairs: int, 
     to the light at the axis's end and to the light at its start.
     """
     parts = wp.vec2i(*(parts_of(lattice.gap[n], light_step) for n in range(2)))
-    gaps, ahead = (medium.buffer((pairs, *counts), float) for _ in range(2))
-    nodes = medium.buffer((pairs, *counts), wp.vec2)
+    gaps, nodes = (medium.buffer((pairs, *counts), dtype) for dtype in (wp.float16, int))
     _measure(medium, tuple(counts), [lattice, parts], [gaps], pairs)
     lines = max(counts[:2]) if pairs == 2 else counts[1]
-    wp.launch(_add_up, (pairs, lines, counts[2]), [gaps], [ahead, nodes], device=medium.device)
+    wp.launch(_add_up, (pairs, lines, counts[2]), [gaps], [nodes], device=medium.device)
     return nodes
 
 
@@ -245,7 +246,7 @@ def reach(medium: Medium, place: Sequence[float], radius: float | None, march: M
         return lattice, add_up(medium, lattice, counts, 1, step).reshape(counts)
     lattice, counts = make_lattice(shape, ((1, 0, 0), (0, 1, 0), (0, 0, 1)), spacing, most=_MOST_MARCHING)
     lattice.place, lattice.point, lattice.radius = wp.vec3(*place), 1, float(radius)
-    nodes = medium.buffer(counts, wp.vec2)
+    nodes = medium.buffer(counts, int)
     _reach(medium, counts, [lattice, step], [nodes])
     return lattice, nodes
 

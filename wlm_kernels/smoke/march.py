@@ -307,6 +307,30 @@ def sample(smoke: Any, p: wp.vec3) -> float:
     return _in_brick(smoke.density, smoke.bricks, p)
 
 
+@wp.func_native("""
+    wp::half a, b;
+    a.u = bits & 0xffffu;
+    b.u = bits >> 16u;
+    return wp::vec2(wp::half_to_float(a), wp::half_to_float(b));
+""")
+def unpacked(bits: int) -> wp.vec2: ...
+
+
+@wp.func
+def unpacked(value: float) -> float:
+    return value
+
+
+@wp.func
+def unpacked(value: wp.vec3) -> wp.vec3:
+    return value
+
+
+@wp.func
+def _on_row(nodes: wp.array3d[Any], i: int, j: int, k: int, k1: int, f: float):
+    return wp.lerp(unpacked(nodes[i, j, k]), unpacked(nodes[i, j, k1]), f)
+
+
 @wp.func
 def between_nodes(nodes: wp.array3d[Any], q: wp.vec3):
     """Interpolates an array trilinearly at the index q, which may have fractions; q is clamped to the array."""
@@ -321,8 +345,8 @@ def between_nodes(nodes: wp.array3d[Any], q: wp.vec3):
     k1 = wp.min(k + 1, nodes.shape[2] - 1)
     fy = y - float(j)
     fz = z - float(k)
-    near = wp.lerp(wp.lerp(nodes[i, j, k], nodes[i, j, k1], fz), wp.lerp(nodes[i, j1, k], nodes[i, j1, k1], fz), fy)
-    far = wp.lerp(wp.lerp(nodes[i1, j, k], nodes[i1, j, k1], fz), wp.lerp(nodes[i1, j1, k], nodes[i1, j1, k1], fz), fy)
+    near = wp.lerp(_on_row(nodes, i, j, k, k1, fz), _on_row(nodes, i, j1, k, k1, fz), fy)
+    far = wp.lerp(_on_row(nodes, i1, j, k, k1, fz), _on_row(nodes, i1, j1, k, k1, fz), fy)
     return wp.lerp(near, far, x - float(i))
 
 
@@ -441,39 +465,33 @@ def nodes_along(shape: Sequence[int], step: float) -> tuple[int, ...]:
 
 @functools.cache
 def occupied_kernel(dtype: Any) -> wp.Kernel:
-    """Builds (once) the kernel that says which runs of 8 voxels along z, and a voxel on either side, hold any smoke."""
+    """Builds (once) the kernel that marks the bricks in which an interpolated density may be above 0."""
 
     @wp.kernel(module="unique", module_options=OPTIONS)
-    def rows(
+    def mark(
         # in:
         density: wp.array3d[dtype],
         # out:
-        out: wp.array3d[wp.uint8],
+        bricks: wp.array3d[wp.uint8],
     ):
-        i, j, c = wp.tid()
-        smoke = wp.uint8(0)
-        for k in range(wp.max(c * BRICK - 1, 0), wp.min((c + 1) * BRICK + 1, density.shape[2])):
-            if float(density[i, j, k]) > 0.0:
-                smoke = wp.uint8(1)
-        out[i, j, c] = smoke
+        # Neighbouring threads read neighbouring voxels, each voxel once.
+        a, j, k = wp.tid()
+        first = int(BRICK)
+        last = int(-1)
+        for m in range(BRICK):
+            i = a * BRICK + m
+            if i < density.shape[0] and float(density[wp.min(i, density.shape[0] - 1), j, k]) > 0.0:
+                first = wp.min(first, m)
+                last = m
+        if last >= 0:
+            # A sample in a brick reads up to half a voxel beyond the brick.
+            for x in range(wp.max((a * BRICK + first - 1) // BRICK, 0), (a * BRICK + last + 1) // BRICK + 1):
+                for y in range(wp.max(j - 1, 0) // BRICK, (j + 1) // BRICK + 1):
+                    for z in range(wp.max(k - 1, 0) // BRICK, (k + 1) // BRICK + 1):
+                        if x < bricks.shape[0] and y < bricks.shape[1] and z < bricks.shape[2]:
+                            bricks[x, y, z] = wp.uint8(1)
 
-    return rows
-
-
-@wp.kernel(module="unique", module_options=OPTIONS)
-def _bricks_of_rows(
-    # in:
-    rows: wp.array3d[wp.uint8],
-    # out:
-    bricks: wp.array3d[wp.uint8],
-):
-    a, b, c = wp.tid()
-    smoke = wp.uint8(0)
-    # A sample in a brick reads up to half a voxel beyond the brick.
-    for i in range(wp.max(a * BRICK - 1, 0), wp.min((a + 1) * BRICK + 1, rows.shape[0])):
-        for j in range(wp.max(b * BRICK - 1, 0), wp.min((b + 1) * BRICK + 1, rows.shape[1])):
-            smoke = wp.max(smoke, rows[i, j, c])
-    bricks[a, b, c] = smoke
+    return mark
 
 
 def occupied(medium: Medium) -> wp.array:
@@ -483,11 +501,10 @@ def occupied(medium: Medium) -> wp.array:
         uint8 [X / 8, Y / 8, Z / 8], rounded up: 1 where the brick, or a voxel next to it, has smoke; else 0.
     """
     density = medium.density
-    shape = tuple(-(-n // BRICK) for n in density.shape)
-    # Rows are reduced first, so that neighbouring threads read neighbouring voxels, and each voxel once.
-    rows, bricks = medium.buffer((*density.shape[:2], shape[2]), wp.uint8), medium.buffer(shape, wp.uint8)
-    wp.launch(occupied_kernel(density.dtype), rows.shape, [density], [rows], device=density.device)
-    wp.launch(_bricks_of_rows, shape, [rows], [bricks], device=density.device)
+    bricks = medium.buffer(tuple(-(-n // BRICK) for n in density.shape), wp.uint8)
+    bricks.zero_()
+    size = (bricks.shape[0], *density.shape[1:])
+    wp.launch(occupied_kernel(density.dtype), size, [density], [bricks], device=density.device)
     return bricks
 
 

@@ -34,6 +34,7 @@ from wlm_kernels.smoke.march import (
     require_orthographic,
     size_of,
     surface,
+    unpacked,
 )
 from wlm_kernels.smoke.settings import March
 
@@ -60,7 +61,7 @@ def _guide(smoke_type: Any, from_lattice: bool) -> wp.Kernel:
     def kernel(
         # in:
         smoke: smoke_type,
-        nodes: wp.array3d[wp.vec2],
+        nodes: wp.array3d[int],
         view: View,
         lattice: Lattice,
         march: MarchParameters,
@@ -118,7 +119,7 @@ def guide(medium: Medium, view: View, march: March, out: wp.array, *, shared: bo
         shared: Whether the optical depths to the top and the bottom are interpolated between the nodes of a lattice,
             at least a voxel apart; otherwise each sample marches to the lights itself, which is slower and more exact.
     """
-    lattice, nodes = Lattice(), medium.buffer((0, 0, 0), wp.vec2)
+    lattice, nodes = Lattice(), medium.buffer((0, 0, 0), int)
     if shared:
         lattice, nodes = reach(
             medium, view.up, None, replace(march, spacing=max(march.step, 1.0), light_step=march.step)
@@ -127,11 +128,11 @@ def guide(medium: Medium, view: View, march: March, out: wp.array, *, shared: bo
 
 
 @wp.func
-def _in_plane(nodes: wp.array4d[wp.vec2], i: int, j: int, k: int, fx: float, fy: float) -> wp.vec4:
+def _in_plane(nodes: wp.array4d[int], i: int, j: int, k: int, fx: float, fy: float) -> wp.vec4:
     sides = wp.vec4()
     for pair in range(2):
-        a = wp.lerp(nodes[pair, i, j, k], nodes[pair, i, j + 1, k], fy)
-        b = wp.lerp(nodes[pair, i + 1, j, k], nodes[pair, i + 1, j + 1, k], fy)
+        a = wp.lerp(unpacked(nodes[pair, i, j, k]), unpacked(nodes[pair, i, j + 1, k]), fy)
+        b = wp.lerp(unpacked(nodes[pair, i + 1, j, k]), unpacked(nodes[pair, i + 1, j + 1, k]), fy)
         c = wp.lerp(a, b, fx)
         sides[2 * pair] = c[0]
         sides[2 * pair + 1] = c[1]
@@ -144,7 +145,7 @@ def _coarse(smoke_type: Any, hot: bool) -> wp.Kernel:
     def kernel(
         # in:
         smoke: smoke_type,
-        nodes: wp.array4d[wp.vec2],
+        nodes: wp.array4d[int],
         view: View,
         lattice: Lattice,
         march: MarchParameters,
@@ -166,7 +167,7 @@ def _coarse(smoke_type: Any, hot: bool) -> wp.Kernel:
         j = wp.clamp(int(y), 0, nodes.shape[2] - 2)
         fx = wp.clamp(x - float(i), 0.0, 1.0)
         fy = wp.clamp(y - float(j), 0.0, 1.0)
-        loaded = int(-1)  # the plane of nodes whose depths are in `near`
+        loaded = int(-2)  # the plane of nodes whose depths are in `near`
         near = wp.vec4()
         far = wp.vec4()
         while r.done < r.count:
@@ -178,7 +179,9 @@ def _coarse(smoke_type: Any, hot: bool) -> wp.Kernel:
                 z = (r.distance - lattice.low[2]) / lattice.gap[2]
                 k = wp.clamp(int(z), 0, nodes.shape[3] - 2)
                 if k != loaded:
-                    near = _in_plane(nodes, i, j, k, fx, fy)
+                    near = far
+                    if k != loaded + 1:
+                        near = _in_plane(nodes, i, j, k, fx, fy)
                     far = _in_plane(nodes, i, j, k + 1, fx, fy)
                     loaded = k
                 tau = wp.lerp(near, far, wp.clamp(z - float(k), 0.0, 1.0))
@@ -232,7 +235,7 @@ def _light(smoke_type: Any) -> wp.Kernel:
     def kernel(
         # in:
         smoke: smoke_type,
-        nodes: wp.array3d[wp.vec2],
+        nodes: wp.array3d[int],
         view: View,
         lattice: Lattice,
         march: MarchParameters,
