@@ -121,9 +121,8 @@ def guide(medium: Medium, view: View, march: March, out: wp.array, *, shared: bo
     """
     lattice, nodes = Lattice(), medium.buffer((0, 0, 0), int)
     if shared:
-        lattice, nodes = reach(
-            medium, view.up, None, replace(march, spacing=max(march.step, 1.0), light_step=march.step)
-        )
+        march_up = replace(march, spacing=max(march.step, 1.0), light_step=march.step)
+        lattice, nodes = reach(medium, view, view.up, None, march_up)
     _guide(medium, in_tiles(*out.shape[1:]), [nodes, view, lattice, parameters(march)], [out], shared)
 
 

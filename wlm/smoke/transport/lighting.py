@@ -157,7 +157,7 @@ class Marching:
 
     def reach(self, place: Sequence[float], radius: float | None) -> Depths:
         """Computes the optical depths from the smoke to a light; arguments as for `depth_lattice.reach`."""
-        return depth_lattice.reach(self.medium, place, radius, self.march)
+        return depth_lattice.reach(self.medium, self.view, place, radius, self.march)
 
     def light(self, depths: Depths, out: torch.Tensor) -> None:
         """Computes light scattered once into `out`, float32 [1 or 2, H, W]: from the light and the opposite light."""
