@@ -149,6 +149,10 @@ _COMMANDS: dict[str, tuple[str, tuple[str, ...]]] = {
         "Measure kernels of frames and fits against what the device can do, at several sizes.",
         ("quick", "device", "only", "baseline_path", "plot_path"),
     ),
+    "kernels-profile": (
+        "Profile these kernels by Nsight Compute, which must be installed: what each of them waits for.",
+        ("device", "only"),
+    ),
     "growth": (
         "Simulate a city of lightmaps on 1, 8 and 64 GPUs from measured costs: hours, and what saturates first.",
         ("quick", "device"),

@@ -128,6 +128,13 @@ _TABLES: dict[str, dict[str, Figure]] = {
         "of_floor": Figure("of the floor", "%", ".3g"),
         "slope": Figure("slope", form=".2f"),
         "launches": Figure("launches", form=".3g"),
+        "share_of_time": Figure("of the time", "%", ".3g"),  # the next ones as in `benchmarks.kernels_profile`
+        "memory_busy": Figure("memory", "%", ".2g"),
+        "l2_busy": Figure("L2", "%", ".2g"),
+        "l1_busy": Figure("L1", "%", ".2g"),
+        "issue_busy": Figure("issue", "%", ".2g"),
+        "warps_active": Figure("warps", "%", ".2g"),
+        "registers": Figure("registers", form=_WHOLE),
         "moved_bytes": Figure("bytes", "bytes", _WHOLE),
         "operations": Figure("operations", form=".3g"),
         "storage_busy": Figure("storage busy", "%", ".1f"),  # this and the next ones as in `benchmarks.growth`

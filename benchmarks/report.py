@@ -22,12 +22,14 @@ class _Shown:
         figures: Names of the columns.
         which: Regular expression of method and option, with a space between them.
         last: Whether to show only the last row of each method.
+        notes: Whether to show the rows' notes.
     """
 
     scene: str
     figures: str
     which: str = ".*"
     last: bool = False
+    notes: bool = False
 
 
 _QUALITY = "bytes bpp psnr seen between border view_psnr"
@@ -56,7 +58,10 @@ _PAGES = {
         _Shown("jet, albedo 1", _ORDERS),
         _Shown("unseen smoke", "psnr time_ms", "time against error .*"),
     ],
-    "kernels": [_Shown("cuda", "time_ms size floor_ms of_floor slope launches", last=True)],
+    "kernels": [
+        _Shown("cuda", "time_ms size floor_ms of_floor slope launches", last=True),
+        _Shown("cuda, profile", "share_of_time memory_busy l2_busy issue_busy warps_active", notes=True),
+    ],
     "growth": [_Shown("city of lightmaps", "hours storage_busy cores_busy gpus_busy repeated")],
 }
 
@@ -138,7 +143,8 @@ def _page_table(
         commands[f"`{about['command']} --json {path}`: {machine}, {versions}, {about['date'][:10]}"] = None
     labels = [[row.method, row.option, path.stem] for path, _, row in chosen]
     figures = {name: FIGURES[name] for name in names}
-    lines = _table(figures, "", [row for _, _, row in chosen], labels, [""] * len(chosen))
+    notes = [row.notes if shown.notes else "" for _, _, row in chosen]
+    lines = _table(figures, "", [row for _, _, row in chosen], labels, notes)
     lines[0] = lines[0].replace("|  |  |  |", "| method | option | file |", 1)
     return [f"## {shown.scene}\n", *lines, ""]
 

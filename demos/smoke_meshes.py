@@ -1,4 +1,5 @@
-"""Makes the meshes of the scenes of smoke that are shipped, `configs/meshes`: a rabbit and the wheel of a fan.
+"""Makes the meshes of the scenes of smoke that are shipped, `configs/meshes`: a rabbit, and the wheel and
+the housing of a fan.
 
 The command is `python -m demos.smoke_meshes configs/meshes`.
 """
@@ -26,7 +27,7 @@ _PARTS = (
 )
 _ROUND = 0.035  # radius of the fillets between parts
 _CELLS = 36  # of the grid along a rabbit's height
-_BLADES = 5
+_BLADES, _VANES = 4, 6
 
 
 def rabbit() -> trimesh.Trimesh:
@@ -55,29 +56,45 @@ def rabbit() -> trimesh.Trimesh:
 
 
 def fan() -> trimesh.Trimesh:
-    """A wheel of twisted blades around a hub, of radius 1, with its axis along x, which throws air outwards."""
-    hub = trimesh.creation.cylinder(0.2, 0.36, sections=24)
-    hub.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, (0, 1, 0)))
-    parts = [hub]
-    stations = np.linspace(0.15, 1.0, 9)
-    rows = []
+    """A wheel of twisted blades around a hub, of radius 1, with its axis along x: turned about +x it blows along +x."""
+    parts = [_along_x(trimesh.creation.cylinder(0.3, 0.4, sections=24))]
+    stations, rows = np.linspace(0.24, 1.0, 9), []
     for r in stations:
-        pitch, chord = np.radians(50 - 25 * r), 0.24 + 0.2 * r
+        pitch, chord = min(np.arctan(0.55 / r), 1.0), 0.24 * min(1.0, 0.5 + 0.6 * r)
         along = np.array([np.sin(pitch), 0.0, -np.cos(pitch)])
-        thick = 0.045 * np.array([np.cos(pitch), 0.0, np.sin(pitch)])
+        thick = 0.05 * np.array([np.cos(pitch), 0.0, np.sin(pitch)])
         rows.append([s * chord * along + t * thick + (0, r, 0) for s, t in ((-1, -1), (1, -1), (1, 1), (-1, 1))])
     points = np.array(rows).reshape(-1, 3)
     k = np.arange(len(stations) - 1)[:, None, None] * 4
     ring = np.array([[(a, a + 4, (a + 1) % 4), ((a + 1) % 4, a + 4, (a + 1) % 4 + 4)] for a in range(4)])
     ends = np.array([(0, 1, 2), (0, 2, 3)])
     faces = np.concatenate([(ring.reshape(-1, 3) + k).reshape(-1, 3), ends, ends[:, ::-1] + points.shape[0] - 4])
-    for number in range(_BLADES):
-        turn = trimesh.transformations.rotation_matrix(2 * np.pi * number / _BLADES, (1, 0, 0))
-        blade = trimesh.Trimesh(points, faces, process=False).apply_transform(turn)
-        parts.append(blade if blade.volume > 0 else trimesh.Trimesh(blade.vertices, blade.faces[:, ::-1]))
-    return trimesh.util.concatenate(parts)
+    return _joined([*parts, *_around(trimesh.Trimesh(points, faces, process=False), _BLADES)])
+
+
+def housing() -> trimesh.Trimesh:
+    """The duct around the wheel, and vanes behind it that stop the turn of the air: without them the air leaves a
+    wheel of so few cells turning with it, and is thrown outwards instead of ahead."""
+    duct = _along_x(trimesh.creation.annulus(1.12, 1.26, 1.3, sections=48)).apply_translation((0.25, 0, 0))
+    vane = trimesh.creation.box((0.5, 1.0, 0.08)).apply_translation((0.65, 0.65, 0))
+    return _joined([duct, *_around(vane, _VANES)])
+
+
+def _along_x(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    return mesh.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, (0, 1, 0)))
+
+
+def _around(mesh: trimesh.Trimesh, count: int) -> list[trimesh.Trimesh]:
+    turns = [trimesh.transformations.rotation_matrix(2 * np.pi * k / count, (1, 0, 0)) for k in range(count)]
+    return [mesh.copy().apply_transform(turn) for turn in turns]
+
+
+def _joined(parts: list[trimesh.Trimesh]) -> trimesh.Trimesh:
+    """All parts as one mesh, each with its outside out."""
+    outward = [part if part.volume > 0 else trimesh.Trimesh(part.vertices, part.faces[:, ::-1]) for part in parts]
+    return trimesh.util.concatenate(outward)
 
 
 if __name__ == "__main__":
-    for name, made in (("rabbit", rabbit()), ("fan", fan())):
+    for name, made in (("rabbit", rabbit()), ("fan", fan()), ("fan-housing", housing())):
         made.export(Path(sys.argv[1]) / f"{name}.ply")

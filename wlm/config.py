@@ -77,7 +77,7 @@ def check_settings(
 def profile_path(system: str, name: str) -> Path:
     """Finds the profile `configs/<system>-<name>.yaml`, in a checkout or in the installed package."""
     file_name = f"{system}-{name}.yaml"
-    for folder in _profile_folders():
+    for folder in profile_folders():
         # The name is compared with the listing and not joined to a path, so that `../x` cannot leave the folder.
         for candidate in folder.glob("*.yaml"):
             if candidate.name == file_name:
@@ -89,11 +89,12 @@ def profile_path(system: str, name: str) -> Path:
 def profile_names(system: str) -> list[str]:
     """Returns the sorted names of a system's profiles; `system` is the first part of the names of their files."""
     prefix = f"{system}-"
-    files = {file.stem for folder in _profile_folders() for file in folder.glob(f"{prefix}*.yaml")}
+    files = {file.stem for folder in profile_folders() for file in folder.glob(f"{prefix}*.yaml")}
     return sorted(stem.removeprefix(prefix) for stem in files)
 
 
-def _profile_folders() -> Iterator[Path]:
+def profile_folders() -> Iterator[Path]:
+    """Finds the folders of the shipped profiles: of a checkout, and of the installed package."""
     root = Path(__file__).resolve().parents[1]
     # An installed package is in site-packages; only a checkout has a pyproject.toml beside the package.
     if (root / "pyproject.toml").is_file() and (root / "configs").is_dir():

@@ -138,7 +138,7 @@ def _placed(error: torch.Tensor, sizes: list[Size], part: _Part, share: float, p
     )
     if room < error.shape[1] * min(size.bits for size in sizes):
         return None
-    return layout(error, sizes, room, least_gain(part.scene.sheets[0]))
+    return layout(error, sizes, room, least_gain(FineGrid(part.scene.sheets[0], str(error.device))))
 
 
 def _bits(placed: Layout | None, part: _Part, share: float, profile: Profile) -> float:

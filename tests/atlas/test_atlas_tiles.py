@@ -301,7 +301,7 @@ def test_a_texture_comes_back(codec, shape):
     blocks, decoded = encode(texels.astype(np.float16), codec)
     rows, columns = block_grid(*shape)
     assert blocks.dtype == np.uint8 and blocks.shape == (rows * columns, 16)
-    assert decoded.dtype == np.float32 and decoded.shape == texels.shape
+    assert decoded.dtype == np.float16 and decoded.shape == texels.shape
     np.testing.assert_allclose(decoded, texels, rtol=0.02, atol=0.02)
     np.testing.assert_array_equal(decode(blocks, *shape, codec), decoded)
     blocks.flags.writeable = False

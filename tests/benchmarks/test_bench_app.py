@@ -73,6 +73,7 @@ COMMANDS = [
         "smoke-network --device cpu --network young.safetensors --profile paper",
         {"networks": [Path("a/young.safetensors")], "profiles": ["paper"]},
     ),
+    (["kernels-profile", "--only", "rasterize"], "kernels-profile --device cpu --only rasterize", {}),
     (["ops", "--only", "plane"], "ops --device cpu --only plane", {"only": ["plane"]}),
     *(
         ([name, "--quick"], f"{name} --quick --device cpu", {"quick": True})

@@ -1,5 +1,6 @@
 """The kernels' benchmark: ceilings, a case at two sizes, the comparison with an older run, and the plot."""
 
+from collections import defaultdict
 from dataclasses import replace
 
 import pytest
@@ -8,6 +9,9 @@ from benchmarks import write_json
 from benchmarks.ceilings import KINDS
 from benchmarks.kernel_cases import CASES, Work
 from benchmarks.kernels import run
+from benchmarks.kernels_profile import run as profile
+from benchmarks.kernels_profile import summarise
+from benchmarks.runner import Bench
 from wlm.errors import WlmError
 
 CASE = "atlas, read"
@@ -43,3 +47,41 @@ def test_cases():
     assert set(Work().amounts()) <= set(KINDS)
     with pytest.raises(WlmError, match="--only"):
         run(device="cpu", only=["nothing"])
+
+
+def test_a_profile():
+    """Launches of one kernel are summed, weighted by time; the busiest unit and what warps wait for are named."""
+    launches = [
+        _launch(
+            "void wp::kernels__locals__step_1f_cuda_kernel_forward<4>(int)",
+            3000,
+            90.0,
+            {"long_scoreboard": 5.0, "wait": 1.0},
+        ),
+        _launch(
+            "void wp::kernels__locals__step_1f_cuda_kernel_forward<4>(int)",
+            1000,
+            50.0,
+            {"long_scoreboard": 5.0, "wait": 1.0},
+        ),
+        _launch("copy", 1000, 20.0, {"barrier": 2.0, "drain": 3.0}),
+    ]
+    first, second = summarise(Bench("kernels-profile", "cpu", None).row, CASE, launches)
+    assert (first.method, first.option, first["launches"]) == (CASE, "step", 2) and first["share_of_time"] == 0.8
+    assert first["memory_busy"] == pytest.approx(0.8) and first.notes.startswith("bound by memory; warps wait for glob")
+    assert (
+        second.notes.startswith("bound by latency with few warps active (40 registers") and "drain" not in second.notes
+    )
+    assert "stores at its end, then for other warps" in second.notes
+    with pytest.raises(WlmError, match="expected cuda"):
+        profile(device="cpu")
+
+
+def _launch(name, time, memory, stalls):
+    row = defaultdict(
+        str, {"Kernel Name": name, "gpu__time_duration.sum": f"{time:,}", "launch__registers_per_thread": "40"}
+    )
+    row["gpu__dram_throughput.avg.pct_of_peak_sustained_elapsed"] = str(memory)
+    return row | {
+        f"smsp__average_warps_issue_stalled_{key}_per_issue_active.ratio": str(v) for key, v in stalls.items()
+    }

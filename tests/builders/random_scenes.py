@@ -1,12 +1,20 @@
 """Scenes of smoke drawn at random from a seed, at the ends of what a file may say: speeds, viscosities, thin things."""
 
+from pathlib import Path
+
 import numpy as np
 
 from wlm.fluid.faces import FACES
 
+FAN = Path(__file__).parents[2] / "configs" / "meshes" / "fan.ply"
+SAIL = "v -1 0 -1\nv 1 0 -1\nv 0 .5 1\nv 2 1 2\nf 1 2 3\nf 2 3 4\n"
+"""An OBJ file of two triangles, which bound no solid."""
 
-def random_scene(seed: int) -> dict:
-    """Draws a small scene in which every setting may be extreme, in the form of its YAML file."""
+
+def random_scene(seed: int, folder: Path) -> dict:
+    """Draws a small scene in which every setting may be extreme, in the form of its YAML file; its meshes lie in
+    `folder`."""
+    (folder / "sail.obj").write_text(SAIL)
     random = np.random.default_rng([39, seed])
     pick, chance = random.choice, lambda share: bool(random.random() < share)
     cells = random.integers(1 if chance(0.1) else 4, 13, 3)
@@ -32,6 +40,27 @@ def random_scene(seed: int) -> dict:
         if chance(0.6):
             inlet |= {"centre": place(0.1).tolist(), "radius": cell * 10 ** random.uniform(-0.5, 1)}
         inlets.append(inlet | {"temperature": float(pick([0.0, 1.0, 30.0]))})
+
+    def body() -> dict:
+        """Draws a shape at a place, on a path and in turns up to ten times as fast as the inlets."""
+        shape = str(pick(["sphere", "box", "cylinder", str(folder / "sail.obj"), str(FAN)]))
+        radius = cell * 10 ** random.uniform(-2, 0.8, 3)
+        out = {"shape": shape, "radius": radius.max() if shape == "sphere" else radius.tolist()}
+        if "." in shape:
+            out = {"shape": shape, "scale": radius.max(), "shell": [None, True, False][random.integers(3)]}
+        path = [[random.uniform(-1, 1) / rate, *place(0.4)]]
+        for _ in range(random.integers(0, 4)):
+            moved = random.normal(size=3)
+            moved *= cell * 10 ** random.uniform(-1, 1) / np.linalg.norm(moved)
+            taken = np.linalg.norm(moved) / (speed * 10 ** random.uniform(-1, 1))
+            path.append([path[-1][0] + taken, *(np.array(path[-1][1:]) + moved)])
+        turn = [[random.uniform(-1, 1) / rate, *random.uniform(-400, 400, 3)]] if chance(0.4) else []
+        if chance(0.5) and turn:
+            span = np.radians(700) * radius.max() / (speed * 10 ** random.uniform(-1, 1))
+            turn.append([turn[0][0] + span, *random.uniform(-400, 400, 3)])
+        keys = {"path": path, "turn": turn, "offset": [radius.min() * chance(0.2), 0, 0]}
+        return out | {name: np.array(rows).astype(float).tolist() for name, rows in keys.items()}
+
     # Frames of some twenty steps at the speed of the inlets.
     rate = speed / (cell * random.uniform(1, 4))
     frames = int(random.integers(1, 6))
@@ -41,20 +70,13 @@ def random_scene(seed: int) -> dict:
         stop = None if chance(0.5) else start + 10 ** random.uniform(-4, 0.5) / rate
         what = {"density": float(pick([0.0, 1.0, 100.0])), "temperature": float(pick([0.0, 1.0, 10.0]))}
         where = {"centre": place(0.3).tolist(), "radius": cell * 10 ** random.uniform(-2, 0.7)}
+        if chance(0.5):
+            where = body()
+        if chance(0.3):
+            noise = {"amount": 10 ** random.uniform(-1, 2), "size": cell * 10 ** random.uniform(-1, 1)}
+            what["noise"] = noise | {"duration": 1.0 / rate}
         sources.append(where | what | {"start": start, "stop": stop})
-    obstacles = []
-    for _ in range(random.integers(0, 4)):
-        shape = str(pick(["sphere", "box", "cylinder"]))
-        radius = cell * 10 ** random.uniform(-2, 0.8, 3)
-        body = {"shape": shape, "radius": radius.max() if shape == "sphere" else radius.tolist()}
-        path = [[random.uniform(-1, 1) / rate, *place(0.4)]]
-        for _ in range(random.integers(0, 4)):
-            # Up to ten times as fast as the inlets.
-            moved = random.normal(size=3)
-            moved *= cell * 10 ** random.uniform(-1, 1) / np.linalg.norm(moved)
-            taken = np.linalg.norm(moved) / (speed * 10 ** random.uniform(-1, 1))
-            path.append([path[-1][0] + taken, *(np.array(path[-1][1:]) + moved)])
-        obstacles.append(body | {"path": [[float(number) for number in key] for key in path]})
+    obstacles = [body() for _ in range(random.integers(0, 4))]
     pull = speed * speed / float(size.max())  # a speed over the box
     smoke = {"buoyancy": pull * 10 ** random.uniform(-2, 2) if chance(0.6) else 0.0}
     smoke |= {
@@ -84,5 +106,6 @@ def random_scene(seed: int) -> dict:
         for each in (*inlets, *sources):
             each["fuel"] = float(pick([0.0, 1.0, 10.0]))
     grid = {"cells": cells.tolist(), "cell": cell, "refine": int(random.integers(1, 4)), "origin": origin.tolist()}
+    lamp = {"position": place(0.5).tolist(), "intensity": [cell * cell] * 3, "radius": cell * chance(0.5)}
     scene = {"name": f"random {seed}", "grid": grid | {"faces": faces}, "smoke": smoke, "air": air, "inlets": inlets}
-    return scene | {"sources": sources, "obstacles": obstacles, "frames": frames, "rate": rate}
+    return scene | {"lights": [lamp], "sources": sources, "obstacles": obstacles, "frames": frames, "rate": rate}

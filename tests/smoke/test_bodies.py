@@ -7,15 +7,16 @@ import numpy as np
 import pytest
 import trimesh
 import yaml
-from builders.smoke_plumes import SCENE
+from builders.smoke_plumes import SCENE, plume
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
 from wlm.errors import WlmError
 from wlm.smoke import meshes
-from wlm.smoke.data import open_frames
+from wlm.smoke.data import load_frames, open_frames, read_shaded, write_six_way
+from wlm.smoke.march.six_way import bake
 from wlm.smoke.meshes import read_surface
-from wlm.smoke.scene import ObstacleSettings, Scene, load_scene, obstacle_mesh
+from wlm.smoke.scene import CameraSettings, ObstacleSettings, Scene, load_scene, make_camera, obstacle_mesh
 from wlm.smoke.simulation import advance, make_solver, sources_at, warnings_of
 
 CELL = 0.05
@@ -172,6 +173,21 @@ def test_a_resumed_scene_knows_its_mesh(tmp_path):
     other = _scene(tmp_path, [body | {"shape": _file(tmp_path, "other.glb", _part(slice(9, None)))}])
     with pytest.raises(WlmError, match="cannot resume: its frames have another obstacles"):
         open_frames(tmp_path / "a", other, resume=True)
+
+
+def test_a_folder_with_meshes_can_be_moved(tmp_path):
+    """Frames and lightmaps name meshes relative to their folder, and shipped ones by the name that a scene gives."""
+    home = tmp_path / "old"
+    home.mkdir()
+    rabbit = {"shape": "meshes/rabbit.ply", "centre": [0, 0, 0]}
+    scene = _scene(home, [{"shape": _file(home), "centre": [0, 0, 0]}, rabbit])
+    open_frames(home / "frames", scene).file(1).write_bytes(b"")
+    six = bake(plume(), make_camera(CameraSettings(resolution=4), scene.grid.origin, scene.grid.size))
+    write_six_way(home / "six.exr", six, scene.looks(1))
+    home = home.rename(tmp_path / "new")
+    shapes = [str(home / "ball.glb"), load_scene("rabbit").obstacles[0].shape]
+    for moved in (load_frames(home / "frames").scene, read_shaded(home / "six.exr")[1]):
+        assert [each.shape for each in moved.obstacles] == shapes
 
 
 def test_a_body_turns_as_its_rows_say():

@@ -38,6 +38,9 @@ from wlm.smoke.scene import (
 )
 from wlm.smoke.shading import PointLight
 from wlm.smoke.simulation import warnings_of
+from wlm.smoke.transport.lighting import light_smoke
+from wlm.smoke.transport.orders import orders_march
+from wlm.view.smoke import picture
 
 BOX = {"shape": "box"}
 QUICK = range(8)
@@ -128,22 +131,27 @@ def test_a_source_smaller_than_a_voxel_emits_its_amount(tmp_path):
 def test_random_scenes(seed, tmp_path):
     """Each runs to its end with finite values, or is refused in one line before its first frame."""
     try:
-        scene = check_settings(Scene, random_scene(seed), "")
+        scene = check_settings(Scene, random_scene(seed, tmp_path), "")
         solver = simulation.make_solver(scene)
     except WlmError as error:
         assert "\n" not in str(error)
         return
-    warnings = simulation.warnings_of(scene)
-    smoke = False
+    warnings, smoke, bodies = simulation.warnings_of(scene), False, set()
     for frame in range(1, scene.frames + 1):
         simulation.advance(scene, solver, frame)
         solver.check()
         assert np.isfinite(solver.velocity.numpy()).all()
         density = solver.density.numpy()
         assert np.isfinite(density).all() and density.min() >= 0.0
-        smoke = smoke or density.any()
+        smoke, bodies = smoke or density.any(), bodies | set(np.unique(solver.solid.numpy()).tolist())
     emitters = sum(bool(each.density) for each in (*scene.sources, *scene.inlets))
     assert smoke or emitters <= sum("sources" in each or "inlets" in each for each in warnings)
+    for k, body in enumerate(scene.obstacles):
+        assert k + 1 in bodies or body.eased.moves or any(f"obstacles.{k}:" in each for each in warnings)
+    volume = simulation.volume_of(scene, solver)
+    camera = make_camera(CameraSettings(resolution=6), scene.grid.origin, scene.grid.size)
+    lit = light_smoke(volume, camera, [light.light() for light in scene.lights], orders_march(volume))
+    assert torch.isfinite(picture(lit, obstacles=scene.obstacles, time=scene.time(scene.frames))).all()
 
 
 def test_fire_of_a_scene(tmp_path):

@@ -18,14 +18,14 @@ from wlm.atlas.model import BLOCK_SIDE
 from wlm.errors import WlmError
 from wlm.formats import hdr_blocks
 from wlm.formats.exr import HALF_MAX
-from wlm.formats.shared_exponent import LARGEST, pack_rgb9e5, unpack_rgb9e5
+from wlm.formats.shared_exponent import LARGEST
 from wlm.ops.bc6h import bc6h_blocks
 
 BLOCK_CODECS = ("bc6h", "astc")
 _EXTRA = "atlas"
 _MANTISSA = 512  # mantissa steps of RGB9E5, and its least exponent, where the largest channel is below 2 ** -15
 _LEAST_EXPONENT = -15
-_FRACTION = 24
+_SCALE_BIAS = 127 - 24  # from a stored exponent to the exponent bits of a mantissa's float32 scale
 
 
 def block_grid(height: int, width: int) -> tuple[int, int]:
@@ -41,11 +41,11 @@ def quantise(
     """
     if colour in BLOCK_CODECS:
         blocks, decoded = encode(texels, colour, weight, device)
-        return {"texels": decoded.astype(np.float16), "blocks": blocks}
+        return {"texels": decoded, "blocks": blocks}
+    if colour == "rgb9e5":
+        return {"texels": _rounded(_on(texels, device)).half().cpu().numpy()}
     texels = texels.cpu().numpy() if isinstance(texels, torch.Tensor) else texels
-    if colour == "half":
-        return {"texels": texels.clip(0.0, HALF_MAX).astype(np.float16)}
-    return {"texels": unpack_rgb9e5(pack_rgb9e5(texels)).astype(np.float16)}
+    return {"texels": texels.clip(0.0, HALF_MAX).astype(np.float16)}
 
 
 def stored(samples: torch.Tensor, weight: torch.Tensor, colour: str) -> torch.Tensor:
@@ -70,7 +70,8 @@ def _rounded(samples: torch.Tensor) -> torch.Tensor:
     largest = samples.amax(-1, keepdim=True)
     # The exponent of a number from 1/2 to 1 times a power of two.
     exponent = torch.frexp(largest)[1].clamp(min=_LEAST_EXPONENT) - _LEAST_EXPONENT
-    scale = torch.ldexp(torch.ones_like(largest), exponent - _FRACTION)
+    # The bits of a power of two, which a GPU's function would round.
+    scale = (exponent + _SCALE_BIAS << 23).view(torch.float32)
     scale = torch.where((largest / scale).round() >= _MANTISSA, 2.0 * scale, scale)
     return (samples / scale).round() * scale
 
@@ -93,7 +94,7 @@ def encode(
     """Encodes a linear texture, [H, W, 3] on any device, as "bc6h" or "astc". Values, also infinite ones, are clamped
     to [0, 65504]. If H or W is no multiple of 4, the last row or column is repeated.
 
-    Returns blocks, uint8 [B, 16], row by row; and their decoded texels, float32 [H, W, 3].
+    Returns blocks, uint8 [B, 16], row by row; and their decoded texels, half [H, W, 3].
     """
     light = _on(texels, device)
     if count := int(light.isnan().any(2).sum()):
@@ -108,9 +109,9 @@ def encode(
         padded = pad(weight.float(), (0, right, 0, below))[None, ..., None]
         blocks, decoded = bc6h_blocks(_by_block(light[None]), _by_block(padded)[..., 0])
         whole = _of_blocks(decoded, 1, *light.shape[:2])[0, :height, :width]
-        return blocks.cpu().numpy(), whole.cpu().numpy()
+        return blocks.cpu().numpy(), whole.half().cpu().numpy()
     blocks = np.frombuffer(_astc().encode(light.half().cpu().numpy()), np.uint8).reshape(-1, 16).copy()
-    return blocks, decode(blocks, height, width, codec)
+    return blocks, decode(blocks, height, width, codec).astype(np.float16)
 
 
 def decode(blocks: np.ndarray, height: int, width: int, codec: str) -> np.ndarray:

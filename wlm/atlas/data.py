@@ -650,7 +650,7 @@ def _checked_light(
             f"{name}: all triangles together have {texels:.2g} texels of {width} x {height} in {used}: are "
             "its UVs in [0, 1]?"
         )
-    coverage = covered_texels(uv, triangle, height, width)
+    coverage = covered_texels(uv, triangle, height, width).numpy()
     overlaps = np.count_nonzero(coverage > 1)
     if overlaps:
         warnings.append(f"{name}: {_count(overlaps, 'texel')} in several triangles: their UVs overlap")

@@ -181,16 +181,16 @@ def with_fallback(
         if model is not None:
             return model
         size = 1, 1
-    textures = colour.quantise(resized(sheet.lightmap, sheet.mask, *size, device=device), format, device=device)
+    textures = colour.quantise(resized(grid.light, grid.mask, *size, device=device), format, device=device)
     places = (SheetPlace(sheet.name, height, width),)
     settings = (scene.name, scene.source, profile, "plain", format, scene.states, places)
     plain = AtlasModel(*settings, **{name: each[None] for name, each in textures.items()})
     if model is None:
         return replace(plain, report={"why plain": "tiles do not fit the budget"})
-    image, decoders = torch.from_numpy(sheet.lightmap).to(device), [Decoder(each, device) for each in (model, plain)]
+    decoders = [Decoder(each, device) for each in (model, plain)]
     errors = torch.zeros(2, dtype=torch.float64)
     for points, share in _cell_centres(grid, weight):
-        target = texture(image, points.uv)
+        target = texture(grid.light, points.uv)
         for i, decoder in enumerate(decoders):
             errors[i] += float(((decoder(points) - target).double().square().sum(1) * share).sum())
     error, plain_error = errors.tolist()

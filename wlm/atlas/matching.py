@@ -73,7 +73,7 @@ def choose_mesh(
         _, uv, triangle = _joined(group, uv_set)
         if not np.isfinite(uv).all():  # reported where the primitives are checked
             return primitives, []
-        covered += covered_texels(uv.clip(0.0, 1.0), triangle, height, width) > 0
+        covered += covered_texels(uv.clip(0.0, 1.0), triangle, height, width).numpy() > 0
     if np.count_nonzero(covered > 1) <= _SHARED * np.count_nonzero(covered):
         return primitives, []
     charted = [chart_map(*_joined(group, uv_set), height, width) for group in groups]
@@ -292,7 +292,7 @@ def misfits(
         count = np.count_nonzero(charted >= 0)
         if count < max(_FEWEST, texels // 4 if texels >= _FEWEST else 4 * texels):
             continue
-        overlaps = np.count_nonzero(covered_texels(other, triangle, height, width) > 1)
+        overlaps = int((covered_texels(other, triangle, height, width) > 1).sum())
         for turn in picture.turned(charted)[: 2 if words.startswith(_BOX) else None]:
             # A stretched box is only roughly right, and a turned lightmap is a second change.
             if smooth and turn.words:

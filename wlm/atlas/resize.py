@@ -26,17 +26,22 @@ def fitting_size(height: int, width: int, budget: float, block: tuple[int, int],
 
 
 def resized(
-    filled: np.ndarray, mask: np.ndarray, height: int, width: int, filter: str = "fit", device: str = "cpu"
+    filled: torch.Tensor | np.ndarray,
+    mask: torch.Tensor | np.ndarray,
+    height: int,
+    width: int,
+    filter: str = "fit",
+    device: str = "cpu",
 ) -> torch.Tensor:
     """Returns a smaller lightmap, to be read bilinearly, float64 [height, width, 3] in [0, 65504]. `filled` is the
     lightmap without gaps. The filter "box" averages the lightmap over the new texels' squares; "fit" minimises the
     squared error at the texels of the mask. At its own size the lightmap is returned unchanged."""
-    light = torch.from_numpy(filled).to(device).double()
-    if (height, width) == mask.shape:
+    light = torch.as_tensor(filled, device=device).double()
+    if (height, width) == tuple(mask.shape):
         return light
     small = box(light, height, width)
     if filter == "fit":
-        small = _fit(light, torch.from_numpy(mask).to(device), small)
+        small = _fit(light, torch.as_tensor(mask, device=device), small)
     return small.clamp(0.0, HALF_MAX)
 
 
@@ -93,7 +98,11 @@ def _bilinear(new: int, old: int) -> sparse.csr_matrix:
 
 def _box(new: int, old: int) -> sparse.csr_matrix:
     """Makes the matrix [new, old] that averages a row of `old` texels over each of `new` ones."""
-    side, texel = np.arange(new + 1) * (old / new), np.arange(old)
+    side = np.minimum(np.arange(new + 1) * (old / new), old)
+    texel = side[:-1, None].astype(np.int64) + np.arange(int(old / new) + 2)
     weight = np.minimum(side[1:, None], texel + 1.0) - np.maximum(side[:-1, None], texel)
     weight = np.maximum(weight, 0.0)
-    return sparse.csr_matrix(weight / weight.sum(axis=1, keepdims=True))
+    weight /= weight.sum(axis=1, keepdims=True)
+    row = np.broadcast_to(np.arange(new)[:, None], texel.shape)
+    inside = weight > 0.0
+    return sparse.csr_matrix((weight[inside], (row[inside], texel[inside])), shape=(new, old))

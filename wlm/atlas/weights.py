@@ -29,6 +29,16 @@ class FineGrid:
         self.height, self.width = (2 * count for count in sheet.mask.shape)
 
     @cached_property
+    def light(self) -> torch.Tensor:
+        """The sheet's lightmap on the device, float32 [H, W, 3]; copying a large one takes a while."""
+        return torch.from_numpy(self.sheet.lightmap).to(self.device)
+
+    @cached_property
+    def mask(self) -> torch.Tensor:
+        """The sheet's mask on the device, bool [H, W]."""
+        return torch.from_numpy(self.sheet.mask).to(self.device)
+
+    @cached_property
     def triangle(self) -> tuple[torch.Tensor, torch.Tensor]:
         """The triangle at each cell's centre, and the barycentric weights of its corners, as in `texel_triangles`."""
         return texel_triangles(self.sheet, self.height, self.width, self.device)
@@ -50,21 +60,19 @@ class FineGrid:
     @cached_property
     def texels(self) -> torch.Tensor:
         """Whether a cell is part of a mask texel whose centre is in a triangle: bool [2 H, 2 W]."""
-        mask = self.sheet.mask
-        return _quarters(self._covered(*mask.shape) & torch.from_numpy(mask).to(self.device))
+        return _quarters(self._covered(*self.mask.shape) & self.mask)
 
     @cached_property
     def relative(self) -> torch.Tensor:
         """The factor from squared error to squared relative error of light, up to a constant: float64 [2 H, 2 W]."""
-        sheet = self.sheet
-        light = torch.from_numpy(sheet.lightmap).to(self.device).mean(2, dtype=torch.float64)
-        bright = light[torch.from_numpy(sheet.mask).to(self.device)]
+        light = self.light.mean(2, dtype=torch.float64)
+        bright = light[self.mask]
         dark = _DARK * float(np.percentile(bright[:: max(1, len(bright) // _SAMPLES)].cpu().numpy(), _BRIGHT))
         return _quarters(1.0 / (light + (dark or 1.0)).square())
 
     def _covered(self, height: int, width: int) -> torch.Tensor:
-        covered = covered_texels(self.sheet.uv, self.sheet.triangle[self.sheet.active], height, width)
-        return torch.from_numpy(covered > 0).to(self.device)
+        triangle = self.sheet.triangle[self.sheet.active]
+        return covered_texels(self.sheet.uv, triangle, height, width, self.device) > 0
 
 
 def _quarters(texels: torch.Tensor) -> torch.Tensor:
@@ -103,7 +111,7 @@ def spread(
     # A texel is also read at its centre, and a small triangle may contain that centre but no quarter's.
     used = grid.covered | grid.texels | (visible > 0)
     if not used.any():  # the mesh is smaller than a cell, and no pixel shows it
-        used = _quarters(torch.from_numpy(grid.sheet.mask).to(grid.device))
+        used = _quarters(grid.mask)
     if mean is None:
         mean = float(visible[used].mean()) or 1.0
     result = torch.where(used, visible + unseen * mean, 0.0)

@@ -231,7 +231,7 @@ def write_lightmaps(
     else:
         _check_folder(frames.path, output)
         factors = {"extinction": frames.extinction, "emission": frames.emission, "device": where.device[:4]}
-        scene = dict(frames.options) if frames.scene is None else frames.scene.model_dump(mode="json")
+        scene = dict(frames.options) if frames.scene is None else frames.scene.stored(frames.path)
         key = {**settings, **factors, "scene": scene, "camera": camera.model_dump(mode="json")}
         files = NumberedFiles(output, "six", ".exr", SHEET, run=key, resume=resume)
         if resume:

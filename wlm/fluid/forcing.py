@@ -114,7 +114,7 @@ class Fire:
     """Fuel that burns, and hot gas that radiates and expands; see `wlm_kernels.fluid.fire` for the model.
 
     Attributes:
-        rate: Fuel that burns per unit of time.
+        rate: Fuel that burns per unit of time; of fuel below 1 this share of it.
         heat: Temperature that a unit of fuel adds, up to 1.
         smoke: Density that it makes.
         ignition: Least temperature at which it burns.

@@ -293,7 +293,7 @@ def open_frames(folder: str | os.PathLike[str], scene: Scene, *, resume: bool = 
             made = (path for suffix in SUFFIXES for path in numbered(folder, "frame", suffix).values())
             for path in (*made, folder / CHECKPOINT):
                 path.unlink(missing_ok=True)
-    content = {"format": _FORMAT, "version": _VERSION, "scene": scene.model_dump(mode="json")}
+    content = {"format": _FORMAT, "version": _VERSION, "scene": scene.stored(folder)}
     atomic_write(folder / SCENE_FILE, (json.dumps(content, indent=1, allow_nan=False) + "\n").encode())
     return Frames(folder, scene, numbered(folder, "frame", ".npz"))
 
@@ -397,7 +397,7 @@ def write_six_way(path: str | os.PathLike[str], six: SixWay, looks: Looks | None
     for name, plane in ((_TRANSPARENCY, six.transparency), (EMISSION, six.emission), (_DEPTH, six.depth)):
         if plane is not None:
             planes[name] = plane.cpu().numpy()
-    note = {"camera": asdict(six.camera)} | ({} if looks is None else {"looks": looks.model_dump(mode="json")})
+    note = {"camera": asdict(six.camera)} | ({} if looks is None else {"looks": looks.stored(Path(path).parent)})
     write_planes(path, planes, note, whole=(_DEPTH,))
 
 
@@ -473,7 +473,7 @@ def read_shaded(
     six = SixWay(lightmaps, tensors[_TRANSPARENCY], tensors.get(EMISSION), camera, tensors.get(_DEPTH))
     if "looks" not in note:
         return six, None
-    return six, check_settings(Looks, note["looks"], f"{path}: header attribute wlm: looks.")
+    return six, check_settings(Looks, note["looks"], f"{path}: header attribute wlm: looks.", folder=Path(path).parent)
 
 
 @contextmanager
@@ -491,7 +491,7 @@ def _read_scene(folder: Path) -> Scene:
         raise WlmError(f"{path}: expected a scene file that simulate wrote, found other content")
     if content.get("version") != _VERSION:
         raise WlmError(f"{path}: file version: expected {_VERSION}, found {content.get('version')}")
-    return check_settings(Scene, content.get("scene"), f"{path}: scene.")
+    return check_settings(Scene, content.get("scene"), f"{path}: scene.", folder=folder)
 
 
 def _simulated(scene: Scene, until: float) -> dict[str, Any]:
@@ -505,7 +505,7 @@ def _simulated(scene: Scene, until: float) -> dict[str, Any]:
     settings = json.loads(scene.model_dump_json(exclude=others | free))
     settings["sources"] = [
         _moved(each, scene, until)
-        + [each.density, each.temperature, each.noise]
+        + [each.density, each.temperature, each.fuel, each.noise]
         + [(start, None if stop is None or stop >= until else stop) for start, stop in each.spans if start < until]
         for each in scene.sources
         if min(start for start, _ in each.spans) < until

@@ -13,15 +13,16 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 from types import NoneType
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationInfo, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PlainSerializer, ValidationInfo, model_validator
 from pydantic_core import PydanticCustomError
+from pydantic_core.core_schema import SerializationInfo
 from scipy.spatial.transform import Rotation
 
-from wlm.config import check_settings, load_settings, profile_path
+from wlm.config import check_settings, load_settings, profile_folders, profile_path
 from wlm.fluid.black_body import black_body_colour, black_body_light
 from wlm.fluid.faces import FACES
 from wlm.fluid.forcing import Fire, Turbulence, Wind
@@ -56,13 +57,24 @@ def _rising(path: tuple[tuple[float, float, float, float], ...]) -> tuple[tuple[
 
 
 def _shape(shape: str, info: ValidationInfo) -> str:
-    """Returns the name of a shape, or the absolute path of a mesh."""
+    """Returns the name of a shape, or the absolute path of a mesh, which may be a shipped one."""
     if shape in _SIZES:
         return shape
     if Path(shape).suffix.lower() not in SUFFIXES:
         names = ", ".join(_SIZES)
         raise PydanticCustomError("shape", f"expected {names}, or a mesh file ({', '.join(SUFFIXES)})")
-    return os.path.abspath(os.path.join((info.context or {}).get("folder", ""), shape))
+    path = os.path.abspath(os.path.join((info.context or {}).get("folder", ""), shape))
+    shipped = (str(folder / shape) for folder in profile_folders() if (folder / shape).is_file())
+    return path if os.path.exists(path) else next(shipped, path)
+
+
+def _named(shape: str, info: SerializationInfo) -> str:
+    """Returns the path of a mesh as `_shape` finds it again, also when it is moved with the context's folder."""
+    if shape in _SIZES or not info.context:
+        return shape
+    homes = (*map(str, profile_folders()), os.path.abspath(info.context["folder"]))
+    home = next((each for each in homes if Path(shape).is_relative_to(each)), homes[-1])
+    return Path(os.path.relpath(shape, home)).as_posix() if Path(shape).drive == Path(home).drive else shape
 
 
 # Largest angle in degrees between two poses of a path, and largest number of pieces of this size.
@@ -93,6 +105,10 @@ _Glow = Annotated[tuple[tuple[_Number, _NotNegative, _NotNegative, _NotNegative]
 
 class _Settings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    def stored(self, folder: str | os.PathLike[str]) -> dict[str, Any]:
+        """Returns JSON values for a file in a folder, which names meshes relative to itself."""
+        return self.model_dump(mode="json", context={"folder": folder})
 
 
 class Grid(_Settings):
@@ -248,7 +264,7 @@ class Noise(_Settings):
 class Body(_Settings):
     """The form and the path of an obstacle or of a source, as `ObstacleSettings` describes them."""
 
-    shape: Annotated[str, AfterValidator(_shape)] = "sphere"
+    shape: Annotated[str, AfterValidator(_shape), PlainSerializer(_named)] = "sphere"
     radius: _Positive | tuple[_Positive, _Positive, _Positive] | None = None
     scale: _Positive = 1.0
     offset: _Vector = (0.0, 0.0, 0.0)

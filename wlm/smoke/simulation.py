@@ -90,7 +90,7 @@ def warnings_of(scene: Scene) -> list[str]:
         spans = [(max(start, 0.0), end if stop is None else min(stop, end)) for start, stop in body.spans]
         spans = [(start, stop) for start, stop in spans if math.ceil(start / duration) * duration < stop]
         looks = [time for span in spans for time in _looks(scene, *span, body)]
-        seen = [(points, time) for time in looks if len(points := _voxels(scene, body, time))]
+        seen = [(points, time) for time in looks if len(points := _voxels(scene, body, grid.refine, time))]
         if not spans:
             warnings.append(f"sources.{i}: it is not active at a step between 0 and {end:g} s, and emits no smoke")
         elif not seen:
@@ -109,6 +109,8 @@ def warnings_of(scene: Scene) -> list[str]:
         times = obstacle.eased.times
         if _is_outside(scene, obstacle, [0.0, *times[(times > 0.0) & (times < end)], end]):
             warnings.append(f"obstacles.{i}: {box}")
+        elif not obstacle.eased.moves and not len(_voxels(scene, obstacle, 1, 0.0)):
+            warnings.append(f"obstacles.{i}: it reaches no cell's centre in the box, and stops no air")
         elif _is_thin(obstacle, grid.cell):
             warnings.append(
                 f"obstacles.{i}: it is thinner than a cell of {grid.cell:g} m, and is simulated as a cell thick"
@@ -154,20 +156,21 @@ def _is_outside(scene: Scene, body: Body, times: Iterable[float]) -> bool:
     return bool((boxes[:, 1].max(0) <= scene.grid.origin).any() or (boxes[:, 0].min(0) >= high).any())
 
 
-def _voxels(scene: Scene, source: SourceSettings, time: float) -> np.ndarray:
-    """Returns centres of voxels in a source and the box, [N, 3] in cells; of a large source some of them."""
-    grid, edge = scene.grid, scene.grid.voxel
-    low, high = (_around(source, _bounds(source, edge), time) - grid.origin) / edge
-    begin, end = np.ceil(np.maximum(low, 0.0) - 0.5), np.floor(np.minimum(high, grid.shape) - 0.5)
+def _voxels(scene: Scene, body: Body, refine: int, time: float) -> np.ndarray:
+    """Returns centres of voxels, `refine` along a cell, in a body and the box, [N, 3] in cells; of a large body some of
+    them."""
+    grid, edge, shape = scene.grid, scene.grid.cell / refine, refine * np.array(scene.grid.cells)
+    low, high = (_around(body, _bounds(body, edge), time) - grid.origin) / edge
+    begin, end = np.ceil(np.maximum(low, 0.0) - 0.5), np.floor(np.minimum(high, shape) - 0.5)
     axes = [np.unique(np.linspace(*ends, 16).round()) for ends in zip(begin, np.maximum(begin, end), strict=True)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3) + 0.5
-    if source.surface is not None:
+    if body.surface is not None:
         # A thin shell may be between these points.
-        corners, triangles = source.mesh()
-        middles = corners[triangles[:: -(-len(triangles) // 4096)]].mean(1) @ source.eased.turn(time).T
-        points = np.concatenate([points, np.floor((middles + source.eased.at(time) - grid.origin) / edge) + 0.5])
-    points = points[((points > 0.0) & (points < grid.shape)).all(1)]
-    return points[_covers(source, edge, grid.origin + edge * points, time)] / grid.refine
+        corners, triangles = body.mesh()
+        middles = corners[triangles[:: -(-len(triangles) // 4096)]].mean(1) @ body.eased.turn(time).T
+        points = np.concatenate([points, np.floor((middles + body.eased.at(time) - grid.origin) / edge) + 0.5])
+    points = points[((points > 0.0) & (points < shape)).all(1)]
+    return points[_covers(body, edge, grid.origin + edge * points, time)] / refine
 
 
 def _is_hidden(scene: Scene, points: np.ndarray, time: float) -> bool:

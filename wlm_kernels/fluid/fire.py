@@ -4,6 +4,7 @@ Read `_burned` and `test_expansion` in `tests/fluid/test_fire.py` first: they co
 
 - Burning (Feldman, O'Brien and Arikan 2003, "Animating Suspended Particle Explosions", section 4.3): fuel burns at a
   constant rate where it is hot enough, and gives heat and smoke in proportion. Heat is added up to a temperature of 1.
+  Fuel below 1 fills this share of its cell, and burns at this share of the rate: mixing does not make it burn faster.
 - Cooling (Nguyen, Fedkiw and Jensen 2002, "Physically Based Modeling and Animation of Fire", eq. 18):
   dT/dt = -c T^4, with T 0 in ambient air and 1 in the hottest flame; solved exactly in each step.
 - Expansion (ideal gas at low Mach number): div u = D ln K / Dt, with K the absolute temperature. A cell receives its
@@ -27,8 +28,8 @@ _OPTIONS = {"enable_backward": False}
 
 @wp.struct
 class Burning:
-    """A fire in a step of the solver: `fuel` that burns; `heat` and `smoke` of a unit of it; temperature of `ignition`;
-    `radiation` c; `ratio` of a temperature's 1 to the ambient one in kelvin; and factor of the `expansion`."""
+    """A fire in a step of the solver: `fuel` that burns at most; `heat` and `smoke` of a unit of it; temperature of
+    `ignition`; `radiation` c; `ratio` of a temperature's 1 to the ambient one in kelvin; factor of the `expansion`."""
 
     fuel: float
     heat: float
@@ -78,7 +79,7 @@ def burn_kernel(stored: type) -> wp.Kernel:
                 left = float(fuel.density[at])
                 heat = float(fields.temperature[at])
                 if left > 0.0 or heat > 0.0:
-                    burnt = wp.where(heat >= fire.ignition, wp.min(left, fire.fuel), 0.0)
+                    burnt = wp.where(heat >= fire.ignition, wp.min(left, fire.fuel * wp.min(left, 1.0)), 0.0)
                     hot = wp.max(heat, wp.min(heat + fire.heat * burnt, 1.0))
                     hot = hot * wp.pow(1.0 + 3.0 * fire.radiation * hot * hot * hot, -1.0 / 3.0)
                     total += wp.log((1.0 + fire.ratio * hot) / (1.0 + fire.ratio * heat))

@@ -14,7 +14,7 @@ than with each state compressed alone.
 import numpy as np
 import torch
 
-from wlm.atlas.colour import encode
+from wlm.atlas.colour import encode, quantise
 from wlm.atlas.data import LightmappedScene
 from wlm.atlas.model import BLOCK_SIDE, BLOCKS, TEXELS, AtlasModel, Profile, coarse_place, extent, pack_tiles
 from wlm.atlas.shared.allocation import Allocated
@@ -24,7 +24,6 @@ from wlm.atlas.shared.weights import peaks_of, scales, scene_weights, variation
 from wlm.atlas.stages import Stages
 from wlm.atlas.tiles.fit import Tiles, solved
 from wlm.atlas.tiles.layout import Size, texels_of
-from wlm.formats.shared_exponent import pack_rgb9e5, unpack_rgb9e5
 from wlm.interop import moved
 
 _AT_ONCE = 1024  # tiles
@@ -125,11 +124,11 @@ def _textures(tiles: SceneTiles, tried: list[Candidate], given: Allocated) -> tu
                     np.maximum.at(largest, number, values.amax((1, 2)).cpu().numpy())
     scale = np.divide(_BRIGHT, largest, out=np.ones_like(largest), where=largest > 0)
     first, second = (texels * scale[number] for texels, number in zip(light, owner, strict=True))
-    textures = {"texels": unpack_rgb9e5(pack_rgb9e5(first)).astype(np.float16)}
+    textures = quantise(first, TEXELS, device=tiles.device)
     pages = [encode(page, BLOCKS, weight, tiles.device) for page, weight in zip(second, share[1], strict=True)]
     if pages:
         blocks, decoded = (np.stack(each) for each in zip(*pages, strict=True))
-        textures |= {"blocks": blocks, "block_texels": decoded.astype(np.float16)}
+        textures |= {"blocks": blocks, "block_texels": decoded}
     return textures, scale.astype(np.float64)
 
 

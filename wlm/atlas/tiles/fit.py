@@ -19,7 +19,7 @@ import torch
 
 from wlm import interop
 from wlm.atlas import colour
-from wlm.atlas.data import LightmappedScene, Sheet
+from wlm.atlas.data import LightmappedScene
 from wlm.atlas.model import (
     BLOCK_SIDE,
     BLOCKS,
@@ -76,7 +76,7 @@ def fit_tiles(
     """Compresses a scene of one sheet and state to tiles; None if even the smallest tiles exceed the budget."""
     (sheet,) = scene.sheets
     with stages("weights"):
-        tiles = cut(sheet.lightmap, weights(scene, grid, profile, seed), profile.tile, grid.device)
+        tiles = cut(grid.light, weights(scene, grid, profile, seed), profile.tile, grid.device)
     height, width = sheet.mask.shape
     rows, columns = tile_counts(height, width, profile.tile)
     bits = profile.budget * height * width * SOURCE_BITS
@@ -87,7 +87,7 @@ def fit_tiles(
     with stages("curves"):
         error = curves(tiles, sizes, stages)
     with stages("allocate"):
-        packed = layout(torch.from_numpy(error).to(grid.device), sizes, room, least_gain(sheet))
+        packed = layout(torch.from_numpy(error).to(grid.device), sizes, room, least_gain(grid))
         if packed is None:
             return None
     with stages("solve"):
@@ -143,17 +143,18 @@ def composed_model(
     return AtlasModel(*settings, **textures, lut=lut, report=report)
 
 
-def least_gain(sheet: Sheet) -> float:
+def least_gain(grid: FineGrid) -> float:
     """Returns the least squared error that a bit must save to be spent, in proportion to the light's range squared."""
-    return float(np.ptp(sheet.lightmap[sheet.mask])) ** 2 * _LEAST_GAIN / sheet.mask.size
+    low, high = grid.light[grid.mask].aminmax()
+    return float(high - low) ** 2 * _LEAST_GAIN / grid.mask.numel()
 
 
-def cut(image: np.ndarray, weight: torch.Tensor | np.ndarray, size: int, device: str) -> Tiles:
+def cut(image: torch.Tensor | np.ndarray, weight: torch.Tensor | np.ndarray, size: int, device: str) -> Tiles:
     """Cuts a lightmap, float [H, W, 3] without gaps, into tiles. Only tiles with a weight above 0 are returned;
     `weight`, float64 [2 H, 2 W], has the weights of quarters of texels, at least one above 0."""
     index, share = weighted(torch.as_tensor(weight, device=device), size)
     columns = tile_counts(*image.shape[:2], size)[1]
-    light = torch.from_numpy(np.ascontiguousarray(image, np.float32)).to(device)
+    light = torch.as_tensor(image, dtype=torch.float32, device=device)
     parts = [tile_light(patches(light, each, columns, size)) for each in index.split(_AT_ONCE)]
     return Tiles(index, torch.cat(parts), share, size)
 
@@ -295,8 +296,8 @@ def curves(tiles: Tiles, sizes: list[Size], stages: Stages) -> np.ndarray:
         for piece in pieces:
             samples = solve(piece, size.nx, size.ny, rounds).clamp(min=0.0)
             weight = sample_weights(piece, size.nx, size.ny)
-            result.append(errors(piece, colour.stored(samples, weight, size.format)).cpu().numpy())
-        return {"error": np.concatenate(result)}
+            result.append(errors(piece, colour.stored(samples, weight, size.format)))
+        return {"error": torch.cat(result).cpu().numpy()}  # one copy, so that the GPU waits for the CPU once
 
     return np.stack(
         [stages.batch(i, table, functools.partial(at_size, i, size))["error"] for i, size in enumerate(sizes)]
