@@ -46,10 +46,13 @@ class Lighting:
         """Name of the stage in the table of durations."""
         return "lightmaps" if self.albedo is None else "light of all orders"
 
-    def __call__(self, volume: DensityVolume, camera: Camera, lights: Sequence[AnyLight]) -> SixWay | ScatteredSmoke:
-        """Lights the smoke on its device. The result includes the depth of the smoke's surface."""
+    def __call__(
+        self, volume: DensityVolume, camera: Camera, lights: Sequence[AnyLight], drawing: Drawing | None = None
+    ) -> SixWay | ScatteredSmoke:
+        """Lights the smoke on its device, with light of all orders in the shadow of a drawing's obstacles. Lightmaps
+        include the depth of the smoke's surface."""
         if self.albedo is not None:
-            return scatter(volume, camera, lights, self.albedo)
+            return scatter(volume, camera, lights, self.albedo, solid=drawing and drawing.solid(volume))
         if self.network is None:
             return bake_coarse(volume, camera, coarse_march(volume))
         six = self.network(volume, camera)
@@ -97,7 +100,7 @@ def run(
     # A network waits for the device, which a graph cannot capture.
     if lighting.network is None and device != "cpu":
         # The frames before have loaded the kernels.
-        graph = VolumeGraph(lambda volume: drawing(lighting(volume, camera, lights)), device, warmup=1)
+        graph = VolumeGraph(lambda volume: drawing(lighting(volume, camera, lights, drawing)), device, warmup=1)
     smoke = False
     meter = Meter(progress, "run", scene.frames)
     for number in range(1, scene.frames + 1):
@@ -111,7 +114,7 @@ def run(
             graph(volume)
             clock.stop(GRAPH)
         else:
-            made = lighting(volume, camera, lights)
+            made = lighting(volume, camera, lights, drawing)
             clock.stop(lighting.stage)
             drawing(made)
             clock.stop(DRAWING)

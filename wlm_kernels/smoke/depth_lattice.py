@@ -10,13 +10,24 @@ no two of its rays are parallel.
 Units and sampling are those of `march`.
 """
 
+import functools
 import math
 from collections.abc import Sequence
 from typing import Any
 
 import warp as wp
 
-from wlm_kernels.smoke.march import OPTIONS, Medium, View, between_nodes, clip, for_smoke, sample, size_of
+from wlm_kernels.smoke.march import (
+    OPTIONS,
+    Medium,
+    Solid,
+    between_nodes,
+    clip,
+    for_smoke,
+    sample,
+    size_of,
+    way_to_solid,
+)
 from wlm_kernels.smoke.settings import March
 
 MOST_NODES = 2**28
@@ -27,7 +38,8 @@ _MOST_MARCHING = 2**24  # largest number of nodes of a point light, each of whic
 _AT_ONCE = wp.constant(8)  # nodes of a line that a thread sums at a time
 _LEAST_SPACING = 0.25  # voxels between nodes
 _DEEPEST = wp.constant(60000.0)  # largest optical depth, within the range of half floats
-_PARALLEL = 1e-3  # sine of an angle between directions that count as parallel
+_NEVER = wp.constant(1.0e30)
+_DARK = wp.constant(6.0)  # optical depth of an obstacle: a larger one would widen shadows between nodes
 _ROUNDING = 1e-6  # relative excess of a part over the step that is tolerated, so that rounding adds no part
 
 _Several = wp.types.vector(length=int(_AT_ONCE), dtype=float)
@@ -62,7 +74,7 @@ def _halves(a: float, b: float) -> int: ...
 
 @wp.func
 def packed(ahead: float, behind: float) -> int:
-    """Returns two optical depths as half floats in a word, which `march.unpacked` reads."""
+    """Returns two optical depths as half floats in a word, which `march.halves` reads."""
     return _halves(wp.min(ahead, _DEEPEST), wp.min(behind, _DEEPEST))
 
 
@@ -80,43 +92,68 @@ def _node(lattice: Lattice, i: int, j: int, k: int) -> wp.vec3:
 
 
 @wp.func
+def _lit_way(solid: Solid, end: wp.vec4i, lattice: Lattice, toward: wp.vec3) -> float:
+    """Computes how far from the end of a line its nodes are lit by a light beyond the end; negative: nowhere."""
+    p = _node(lattice, end[1], end[2], end[3])
+    if way_to_solid(solid, p, toward) < _NEVER:
+        return -1.0
+    # A gap more, since light is interpolated between nodes: else the lit side of an obstacle would be dark.
+    return way_to_solid(solid, p, -toward) + wp.length(wp.cw_mul(lattice.axes * toward, lattice.gap))
+
+
+@wp.func
 def _on_line(pair: int, line: int, n: int, k: int) -> wp.vec4i:
     """Returns the indices of the n-th node of a line along the first axis (pair 0) or along the second one."""
     return wp.vec4i(pair, wp.where(pair == 0, n, line), wp.where(pair == 0, line, n), k)
 
 
-@wp.kernel(module="unique", module_options=OPTIONS)
-def _add_up(
-    # in:
-    gaps: wp.array4d[wp.float16],
-    # out:
-    nodes: wp.array4d[int],
-):
-    """Sums optical depths from each node of a line to both of its ends; the light is beyond the last node."""
-    pair, line, k = wp.tid()
-    last = wp.where(pair == 0, nodes.shape[1], nodes.shape[2]) - 1
-    if line >= wp.where(pair == 0, nodes.shape[2], nodes.shape[1]):
-        return
-    # In double precision, since the depth ahead is a difference. Several nodes at a time, since loads wait for earlier
-    # stores.
-    ahead = wp.float64(0.0)
-    for n in range(last):
-        q = _on_line(pair, line, n, k)
-        ahead += wp.float64(gaps[q[0], q[1], q[2], q[3]])
-    behind = wp.float64(0.0)
-    for begin in range(0, last, _AT_ONCE):
-        several = _Several()
-        for m in range(_AT_ONCE):
-            q = _on_line(pair, line, wp.min(begin + m, last - 1), k)
-            several[m] = float(gaps[q[0], q[1], q[2], q[3]])
-        for m in range(_AT_ONCE):
-            if begin + m < last:
-                q = _on_line(pair, line, begin + m, k)
-                nodes[q[0], q[1], q[2], q[3]] = packed(float(ahead), float(behind))
-                ahead -= wp.float64(several[m])
-                behind += wp.float64(several[m])
-    q = _on_line(pair, line, last, k)
-    nodes[q[0], q[1], q[2], q[3]] = packed(0.0, float(behind))
+@functools.cache
+def _add_up(obstacles: bool) -> wp.Kernel:
+    @wp.kernel(module="unique", module_options=OPTIONS)
+    def kernel(
+        # in:
+        gaps: wp.array4d[wp.float16],
+        lattice: Lattice,
+        solid: Solid,
+        # out:
+        nodes: wp.array4d[int],
+    ):
+        """Sums optical depths from each node of a line to both of its ends; the light is beyond the last node."""
+        pair, line, k = wp.tid()
+        last = wp.where(pair == 0, nodes.shape[1], nodes.shape[2]) - 1
+        if line >= wp.where(pair == 0, nodes.shape[2], nodes.shape[1]):
+            return
+        # Nodes farther from the last node, and from the first one, are in the shadow of obstacles.
+        lit = float(_NEVER)
+        opposite = float(_NEVER)
+        if wp.static(obstacles):
+            gap = wp.where(pair == 0, lattice.gap[0], lattice.gap[1])
+            lit = _lit_way(solid, _on_line(pair, line, last, k), lattice, axis(lattice, pair)) / gap
+            opposite = _lit_way(solid, _on_line(pair, line, 0, k), lattice, -axis(lattice, pair)) / gap
+        # In double precision, since the depth ahead is a difference. Several nodes at a time, since loads wait for
+        # earlier stores.
+        ahead = wp.float64(0.0)
+        for n in range(last):
+            q = _on_line(pair, line, n, k)
+            ahead += wp.float64(gaps[q[0], q[1], q[2], q[3]])
+        behind = wp.float64(0.0)
+        for begin in range(0, last + 1, _AT_ONCE):
+            several = _Several()
+            for m in range(_AT_ONCE):
+                if begin + m < last:
+                    q = _on_line(pair, line, begin + m, k)
+                    several[m] = float(gaps[q[0], q[1], q[2], q[3]])
+            for m in range(_AT_ONCE):
+                n = begin + m
+                if n <= last:
+                    q = _on_line(pair, line, n, k)
+                    a = float(ahead) + wp.where(float(last - n) > lit, _DARK, 0.0)
+                    b = float(behind) + wp.where(float(n) > opposite, _DARK, 0.0)
+                    nodes[q[0], q[1], q[2], q[3]] = packed(a, b)
+                    ahead -= wp.float64(several[m])
+                    behind += wp.float64(several[m])
+
+    return kernel
 
 
 @for_smoke
@@ -174,7 +211,13 @@ def _reach(smoke_type: Any) -> wp.Kernel:
             d = (last - first) / float(count)
             for n in range(count):
                 tau += d * sample(smoke, p + (first + (float(n) + 0.5) * d) * toward)
-        nodes[i, j, k] = packed(smoke.extinction * tau, 0.0)
+        tau = smoke.extinction * tau
+        if smoke.solid.mesh != wp.uint64(0):
+            # As far from the lit side of an obstacle as a gap, light still falls: see `_lit_way`.
+            skipped = wp.max(lattice.gap)
+            if skipped + way_to_solid(smoke.solid, p + skipped * toward, toward) < away:
+                tau += _DARK
+        nodes[i, j, k] = packed(tau, 0.0)
 
     return kernel
 
@@ -216,14 +259,15 @@ def add_up(medium: Medium, lattice: Lattice, counts: Sequence[int], pairs: int, 
     """Computes the optical depths from the nodes of a lattice of `make_lattice` to one or two `pairs` of opposite
     lights at infinity: at both ends of the lattice's first axis, and of its second.
 
-    `light_step` is the longest step between two nodes, in voxels. Returns vec2 [pairs, X, Y, Z] for each node: depths
-    to the light at the axis's end and to the light at its start.
+    `light_step` is the longest step between two nodes, in voxels. Returns int [pairs, X, Y, Z] for each node: `packed`
+    depths to the light at the axis's end and to the light at its start.
     """
     parts = wp.vec2i(*(parts_of(lattice.gap[n], light_step) for n in range(2)))
     gaps, nodes = (medium.buffer((pairs, *counts), dtype) for dtype in (wp.float16, int))
     _measure(medium, tuple(counts), [lattice, parts], [gaps], pairs)
     lines = max(counts[:2]) if pairs == 2 else counts[1]
-    wp.launch(_add_up, (pairs, lines, counts[2]), [gaps], [nodes], device=medium.device)
+    kernel, inputs = _add_up(medium.solid is not None), [gaps, lattice, medium.solid or Solid()]
+    wp.launch(kernel, (pairs, lines, counts[2]), inputs, [nodes], device=medium.device)
     return nodes
 
 
@@ -233,20 +277,18 @@ def spacing_of(march: March) -> tuple[float, float]:
     return spacing, spacing if march.light_step is None else march.light_step
 
 
-def reach(
-    medium: Medium, view: View, place: Sequence[float], radius: float | None, march: March
-) -> tuple[Lattice, wp.array]:
+def reach(medium: Medium, place: Sequence[float], radius: float | None, march: March) -> tuple[Lattice, wp.array]:
     """Computes optical depths from the smoke to a light at `place`: the direction to a light at infinity, of length 1,
     or the position of a point light in voxels with a radius in voxels, within which its irradiance is constant.
 
-    `view` is the camera of the march. Of `march` only spacing and light_step are used; the lattice of a point light has
-    at most 2^24 nodes. Returns a lattice, and int [X, Y, Z] at its nodes, read by `depths_at`: depths to the light and
-    to the opposite light, for a point light 0.
+    Of `march` only spacing and light_step are used; the lattice of a point light has at most 2^24 nodes. Returns a
+    lattice, and int [X, Y, Z] at its nodes, which `depths_at` reads: depths to the light and to the opposite light, for
+    a point light 0.
     """
     spacing, step = spacing_of(march)
     shape = medium.density.shape
     if radius is None:
-        lattice, counts = make_lattice(shape, _axes(wp.vec3(*place), view), spacing)
+        lattice, counts = make_lattice(shape, _axes(place), spacing)
         return lattice, add_up(medium, lattice, counts, 1, step).reshape(counts)
     lattice, counts = make_lattice(shape, ((1, 0, 0), (0, 1, 0), (0, 0, 1)), spacing, most=_MOST_MARCHING)
     lattice.place, lattice.point, lattice.radius = wp.vec3(*place), 1, float(radius)
@@ -255,11 +297,10 @@ def reach(
     return lattice, nodes
 
 
-def _axes(toward: wp.vec3, view: View) -> tuple[wp.vec3, wp.vec3, wp.vec3]:
-    """Returns the direction to a light, and two directions orthogonal to it. Neighbouring nodes in memory are along the
-    last one, which is as near as possible to the view's, so that a ray reads few stretches of memory."""
-    across = wp.cross(view.forward, toward)
-    if wp.length(across) < _PARALLEL:
-        across = view.right
-    across = wp.normalize(across - wp.dot(across, toward) * toward)
-    return toward, across, wp.cross(toward, across)
+def _axes(toward: Sequence[float]) -> list[tuple[float, float, float]]:
+    """Returns the direction to a light, and two directions orthogonal to it (Duff et al. 2017)."""
+    x, y, z = toward
+    sign = 1.0 if z >= 0.0 else -1.0
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    return [(x, y, z), (1.0 + sign * x * x * a, sign * b, -sign * x), (b, sign + y * y * a, -y)]

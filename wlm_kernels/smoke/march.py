@@ -34,9 +34,21 @@ BRICK = 8
 OPTIONS = {"enable_backward": False}
 """Options of every module of smoke kernels."""
 
-_NEVER = 1.0e30
+_NEVER = wp.constant(1.0e30)
 _SEEDS = 2**32
 _PATTERNS = wp.constant(64)  # number of patterns of the gradient noise, a power of 2
+
+
+@wp.struct
+class Solid:
+    """Obstacles in smoke: a mesh of the world's unit in which the smoke's voxel (0, 0, 0) has its corner at `corner`,
+    the edge of a voxel in this unit, and the distance at which the ray of each pixel of the camera ends, [H, W] in this
+    unit as in `View`. Without obstacles the mesh is 0, and without a camera the distances are empty."""
+
+    mesh: wp.uint64
+    corner: wp.vec3
+    voxel: float
+    stop: wp.array2d[float]
 
 
 @functools.cache
@@ -54,6 +66,7 @@ def smoke_struct(dtype: Any, in_bricks: bool) -> Any:
         bricks: wp.array3d[wp.uint8] if in_bricks else int
         extinction: float
         emission: float
+        solid: Solid
 
     return Smoke
 
@@ -64,7 +77,8 @@ class Medium:
     array like the density's, None for smoke without light, and light emitted per voxel at temperature 1.
 
     `empty` allocates buffers on the density's device; None: Warp's own allocator. `bricks` tells which bricks of 8^3
-    voxels contain smoke, a result of `occupied`; None: marches sample every voxel.
+    voxels contain smoke, a result of `occupied`; None: marches sample every voxel. `solid` are obstacles in the way of
+    light and camera; None: there are none.
     """
 
     density: wp.array
@@ -73,6 +87,7 @@ class Medium:
     emission: float = 0.0
     empty: Empty | None = None
     bricks: wp.array | None = None
+    solid: "Solid | None" = None
 
     @property
     def device(self) -> wp.Device:
@@ -103,6 +118,8 @@ class Medium:
             smoke.temperature, smoke.emission = self.temperature, float(self.emission)
         if self.bricks is not None:
             smoke.bricks = self.bricks
+        if self.solid is not None:
+            smoke.solid = self.solid
         return smoke
 
 
@@ -313,22 +330,27 @@ def sample(smoke: Any, p: wp.vec3) -> float:
     b.u = bits >> 16u;
     return wp::vec2(wp::half_to_float(a), wp::half_to_float(b));
 """)
-def unpacked(bits: int) -> wp.vec2: ...
+def halves(bits: int) -> wp.vec2: ...
 
 
 @wp.func
-def unpacked(value: float) -> float:
-    return value
+def _value(node: int) -> wp.vec2:
+    return halves(node)
 
 
 @wp.func
-def unpacked(value: wp.vec3) -> wp.vec3:
-    return value
+def _value(node: float) -> float:
+    return node
+
+
+@wp.func
+def _value(node: wp.vec3) -> wp.vec3:
+    return node
 
 
 @wp.func
 def _on_row(nodes: wp.array3d[Any], i: int, j: int, k: int, k1: int, f: float):
-    return wp.lerp(unpacked(nodes[i, j, k]), unpacked(nodes[i, j, k1]), f)
+    return wp.lerp(_value(nodes[i, j, k]), _value(nodes[i, j, k1]), f)
 
 
 @wp.func
@@ -388,6 +410,10 @@ def begin(view: View, row: int, column: int, smoke: Any, step: float, offset: fl
     """Makes the ray of a pixel, before its first step; it samples each step at `offset` of its length, 0 to 1."""
     r = ray(view, row, column)
     r = steps_along(size_of(smoke.density), r.origin, r.direction, step)
+    if smoke.solid.stop.shape[0] > 0:
+        left = wp.min(smoke.solid.stop[row, column] / view.voxel - view.moved - r.first, float(r.count) * r.length)
+        r.count = int(wp.ceil(wp.max(left, 0.0) / step))
+        r.length = left / float(wp.max(r.count, 1))
     r.offset = offset
     r.t = 1.0
     return r
@@ -438,6 +464,13 @@ def emitted(r: Ray, smoke: Any) -> float:
 
 
 @wp.func
+def way_to_solid(solid: Solid, p: wp.vec3, toward: wp.vec3) -> float:
+    """Computes the distance in voxels from p to the first obstacle in a direction; 1e30 if there is none."""
+    hit = wp.mesh_query_ray(solid.mesh, solid.corner + solid.voxel * p, toward, _NEVER)
+    return wp.where(hit.result, hit.t / solid.voxel, _NEVER)
+
+
+@wp.func
 def optical_depth(smoke: Any, p: wp.vec3, toward: wp.vec3, step: float) -> float:
     """Computes the optical depth (eq. 3) from p out of the grid, with samples in the middles of steps up to `step`."""
     r = steps_along(size_of(smoke.density), p, toward, step)
@@ -465,33 +498,39 @@ def nodes_along(shape: Sequence[int], step: float) -> tuple[int, ...]:
 
 @functools.cache
 def occupied_kernel(dtype: Any) -> wp.Kernel:
-    """Builds (once) the kernel that marks the bricks in which an interpolated density may be above 0."""
+    """Builds (once) the kernel that says which runs of 8 voxels along z, and a voxel on either side, hold any smoke."""
 
     @wp.kernel(module="unique", module_options=OPTIONS)
-    def mark(
+    def rows(
         # in:
         density: wp.array3d[dtype],
         # out:
-        bricks: wp.array3d[wp.uint8],
+        out: wp.array3d[wp.uint8],
     ):
-        # Neighbouring threads read neighbouring voxels, each voxel once.
-        a, j, k = wp.tid()
-        first = int(BRICK)
-        last = int(-1)
-        for m in range(BRICK):
-            i = a * BRICK + m
-            if i < density.shape[0] and float(density[wp.min(i, density.shape[0] - 1), j, k]) > 0.0:
-                first = wp.min(first, m)
-                last = m
-        if last >= 0:
-            # A sample in a brick reads up to half a voxel beyond the brick.
-            for x in range(wp.max((a * BRICK + first - 1) // BRICK, 0), (a * BRICK + last + 1) // BRICK + 1):
-                for y in range(wp.max(j - 1, 0) // BRICK, (j + 1) // BRICK + 1):
-                    for z in range(wp.max(k - 1, 0) // BRICK, (k + 1) // BRICK + 1):
-                        if x < bricks.shape[0] and y < bricks.shape[1] and z < bricks.shape[2]:
-                            bricks[x, y, z] = wp.uint8(1)
+        i, j, c = wp.tid()
+        smoke = wp.uint8(0)
+        for k in range(wp.max(c * BRICK - 1, 0), wp.min((c + 1) * BRICK + 1, density.shape[2])):
+            if float(density[i, j, k]) > 0.0:
+                smoke = wp.uint8(1)
+        out[i, j, c] = smoke
 
-    return mark
+    return rows
+
+
+@wp.kernel(module="unique", module_options=OPTIONS)
+def _bricks_of_rows(
+    # in:
+    rows: wp.array3d[wp.uint8],
+    # out:
+    bricks: wp.array3d[wp.uint8],
+):
+    a, b, c = wp.tid()
+    smoke = wp.uint8(0)
+    # A sample in a brick reads up to half a voxel beyond the brick.
+    for i in range(wp.max(a * BRICK - 1, 0), wp.min((a + 1) * BRICK + 1, rows.shape[0])):
+        for j in range(wp.max(b * BRICK - 1, 0), wp.min((b + 1) * BRICK + 1, rows.shape[1])):
+            smoke = wp.max(smoke, rows[i, j, c])
+    bricks[a, b, c] = smoke
 
 
 def occupied(medium: Medium) -> wp.array:
@@ -501,10 +540,11 @@ def occupied(medium: Medium) -> wp.array:
         uint8 [X / 8, Y / 8, Z / 8], rounded up: 1 where the brick, or a voxel next to it, has smoke; else 0.
     """
     density = medium.density
-    bricks = medium.buffer(tuple(-(-n // BRICK) for n in density.shape), wp.uint8)
-    bricks.zero_()
-    size = (bricks.shape[0], *density.shape[1:])
-    wp.launch(occupied_kernel(density.dtype), size, [density], [bricks], device=density.device)
+    shape = tuple(-(-n // BRICK) for n in density.shape)
+    # Rows are reduced first, so that neighbouring threads read neighbouring voxels, and each voxel once.
+    rows, bricks = medium.buffer((*density.shape[:2], shape[2]), wp.uint8), medium.buffer(shape, wp.uint8)
+    wp.launch(occupied_kernel(density.dtype), rows.shape, [density], [rows], device=density.device)
+    wp.launch(_bricks_of_rows, shape, [rows], [bricks], device=density.device)
     return bricks
 
 

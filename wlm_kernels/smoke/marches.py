@@ -24,6 +24,7 @@ from wlm_kernels.smoke.march import (
     between_nodes,
     emitted,
     for_smoke,
+    halves,
     in_tiles,
     look,
     optical_depth,
@@ -34,7 +35,6 @@ from wlm_kernels.smoke.march import (
     require_orthographic,
     size_of,
     surface,
-    unpacked,
 )
 from wlm_kernels.smoke.settings import March
 
@@ -121,8 +121,9 @@ def guide(medium: Medium, view: View, march: March, out: wp.array, *, shared: bo
     """
     lattice, nodes = Lattice(), medium.buffer((0, 0, 0), int)
     if shared:
-        march_up = replace(march, spacing=max(march.step, 1.0), light_step=march.step)
-        lattice, nodes = reach(medium, view, view.up, None, march_up)
+        lattice, nodes = reach(
+            medium, view.up, None, replace(march, spacing=max(march.step, 1.0), light_step=march.step)
+        )
     _guide(medium, in_tiles(*out.shape[1:]), [nodes, view, lattice, parameters(march)], [out], shared)
 
 
@@ -130,8 +131,8 @@ def guide(medium: Medium, view: View, march: March, out: wp.array, *, shared: bo
 def _in_plane(nodes: wp.array4d[int], i: int, j: int, k: int, fx: float, fy: float) -> wp.vec4:
     sides = wp.vec4()
     for pair in range(2):
-        a = wp.lerp(unpacked(nodes[pair, i, j, k]), unpacked(nodes[pair, i, j + 1, k]), fy)
-        b = wp.lerp(unpacked(nodes[pair, i + 1, j, k]), unpacked(nodes[pair, i + 1, j + 1, k]), fy)
+        a = wp.lerp(halves(nodes[pair, i, j, k]), halves(nodes[pair, i, j + 1, k]), fy)
+        b = wp.lerp(halves(nodes[pair, i + 1, j, k]), halves(nodes[pair, i + 1, j + 1, k]), fy)
         c = wp.lerp(a, b, fx)
         sides[2 * pair] = c[0]
         sides[2 * pair + 1] = c[1]

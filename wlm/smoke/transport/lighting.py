@@ -7,7 +7,7 @@ towards a light has only the error of its step. `wlm.smoke.transport.orders` add
 import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -19,7 +19,7 @@ from wlm.smoke.camera import Camera
 from wlm.smoke.march.launch import medium_of
 from wlm.smoke.shading import AnyLight, Light, Ramp, checked_albedo, glow_of, in_voxels
 from wlm_kernels.smoke import depth_lattice, marches
-from wlm_kernels.smoke.march import Medium, View
+from wlm_kernels.smoke.march import Medium, Solid, View
 from wlm_kernels.smoke.settings import March
 
 _CLOSE, _FINEST = 0.1, 0.25  # optical depth per step, and least step in voxels
@@ -41,6 +41,7 @@ class LitSmoke:
         march: Settings of the march that computed them.
         thrown: float32 tensor [H, W, 3], light that the smoke emits and scatters to the camera, not yet multiplied by
             the colour of the emission; None: the smoke is cold, or this light was not computed.
+        solid: Obstacles that shadow the smoke and at which rays end; None: there are none.
     """
 
     lights: tuple[AnyLight, ...]
@@ -52,6 +53,7 @@ class LitSmoke:
     camera: Camera
     march: March
     thrown: torch.Tensor | None = None
+    solid: "Solid | None" = None
 
     def shade(
         self,
@@ -120,6 +122,7 @@ def light_smoke(
     march: March | None = None,
     *,
     shadow: float = 1.0,
+    solid: "Solid | None" = None,
 ) -> LitSmoke:
     """Computes light that was scattered once, by a separate march for each light.
 
@@ -130,6 +133,7 @@ def light_smoke(
         march: Settings of the marches; None: those of `fine_march`.
         shadow: Factor of the extinction on the ways to the lights; 1 is physical, a smaller value approximates an
             octave of multiple scattering.
+        solid: Obstacles, of `wlm.view.smoke.Drawing.solid`: they shadow the smoke, and rays end at them.
 
     Returns:
         The light on the smoke's device.
@@ -138,7 +142,7 @@ def light_smoke(
         ValueError: A light has a direction of length 0, or a negative or infinite colour.
     """
     march = fine_march(volume) if march is None else march
-    with marching(volume, camera, march, shadow) as scene:
+    with marching(volume, camera, march, shadow, solid) as scene:
         return light_in(scene, volume, camera, lights)
 
 
@@ -157,7 +161,7 @@ class Marching:
 
     def reach(self, place: Sequence[float], radius: float | None) -> Depths:
         """Computes the optical depths from the smoke to a light; arguments as for `depth_lattice.reach`."""
-        return depth_lattice.reach(self.medium, self.view, place, radius, self.march)
+        return depth_lattice.reach(self.medium, place, radius, self.march)
 
     def light(self, depths: Depths, out: torch.Tensor) -> None:
         """Computes light scattered once into `out`, float32 [1 or 2, H, W]: from the light and the opposite light."""
@@ -172,10 +176,13 @@ class Marching:
 
 
 @contextmanager
-def marching(volume: DensityVolume, camera: Camera, march: March, shadow: float = 1.0) -> Iterator[Marching]:
+def marching(
+    volume: DensityVolume, camera: Camera, march: March, shadow: float = 1.0, solid: "Solid | None" = None
+) -> Iterator[Marching]:
     """Prepares a march on the smoke's device; arguments as for `light_smoke`."""
     with stream(device_name(volume.device)):
-        yield Marching(medium_of(volume).in_bricks(), camera.view(volume), march, shadow)
+        medium = replace(medium_of(volume).in_bricks(), solid=solid)
+        yield Marching(medium, camera.view(volume), march, shadow)
 
 
 def light_in(
@@ -197,4 +204,5 @@ def light_in(
             visit(n, depths)
     transparency, emission, depth = scene.unlit()
     hot = emission if volume.temperature is not None else None
-    return LitSmoke(tuple(lights), *planes, transparency, hot, depth, camera, scene.march)
+    images = (*planes, transparency, hot, depth)
+    return LitSmoke(tuple(lights), *images, camera, scene.march, solid=scene.medium.solid)

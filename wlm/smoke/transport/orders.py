@@ -27,6 +27,7 @@ from wlm.smoke.shading import AnyLight, Light, PointLight, Ramp, checked_albedo
 from wlm.smoke.transport.diffusion import Spreading, share_of, thrown_by_fire
 from wlm.smoke.transport.lighting import LitSmoke, light_in, light_smoke, marching
 from wlm_kernels.smoke import orders
+from wlm_kernels.smoke.march import Solid
 from wlm_kernels.smoke.orders import FEATURES, MIXES, THINNEST
 from wlm_kernels.smoke.settings import March
 
@@ -88,12 +89,17 @@ def orders_march(volume: DensityVolume, g: float = 0.0) -> March:
 
 
 def make_inputs(
-    volume: DensityVolume, camera: Camera, lights: Sequence[AnyLight], albedos: Sequence[float], march: March
+    volume: DensityVolume,
+    camera: Camera,
+    lights: Sequence[AnyLight],
+    albedos: Sequence[float],
+    march: March,
+    solid: "Solid | None" = None,
 ) -> tuple[LitSmoke, Inputs]:
     """Computes light scattered once, whose images it returns, and light by diffusion, and thus the inputs of the
     prediction; `march` has g = 0. To be called inside `wlm.interop.stream`."""
     ways = [aim(light, volume) for light in lights]
-    with marching(volume, camera, march) as scene:
+    with marching(volume, camera, march, solid=solid) as scene:
         spreading = Spreading(scene, volume, lights)
         lit = light_in(scene, volume, camera, lights, spreading.add)
         diffused, thin = spreading.render(albedos)
@@ -242,6 +248,7 @@ def scatter(
     *,
     march: March | None = None,
     model: OrdersModel | None = None,
+    solid: "Solid | None" = None,
 ) -> ScatteredSmoke:
     """Predicts light of all orders of scattering from marches and diffusion.
 
@@ -255,6 +262,7 @@ def scatter(
             multiple scattering is that of isotropic smoke whose extinction is reduced by the share g^2 of light that is
             not deflected (delta-Eddington: Joseph, Wiscombe and Weinman 1976); the error grows with |g|.
         model: The weights; None: those that ship with wlm.
+        solid: Obstacles as for `light_smoke`; light that was scattered once passes through them.
 
     Raises:
         ValueError: The albedo is not three numbers from 0 to 1.
@@ -273,7 +281,7 @@ def scatter(
             thinner = (colour * (1.0 - straight) / left).clip(0.0, 1.0)
             even = replace(march, g=0.0)
         values = sorted(set(map(float, thinner)))
-        lit, inputs = make_inputs(alike, camera, lights, values, even)
+        lit, inputs = make_inputs(alike, camera, lights, values, even, solid)
         planes = model.light(inputs, thinner)
         for n, light in enumerate(lights):
             if (near := share_of(light, alike)) > 0.0:
@@ -282,13 +290,13 @@ def scatter(
             if (factor := aim(light, alike)[1]) != 1.0:
                 planes[n] /= factor
         if march.g != 0.0:
-            once = light_smoke(volume, camera, lights, march)
+            once = light_smoke(volume, camera, lights, march, solid=solid)
             for channel in range(3):
                 planes[..., channel] += colour[channel] * once.planes - thinner[channel] * lit.planes
             planes.clamp_(min=0.0)
             lit = once
         if volume.temperature is not None:
-            with marching(alike, camera, even) as scene:
+            with marching(alike, camera, even, solid=solid) as scene:
                 thrown = thrown_by_fire(scene, alike, values)
             lit = replace(lit, thrown=torch.stack([thrown[values.index(float(value))] for value in thinner], -1))
     return ScatteredSmoke(lit, planes)
