@@ -15,7 +15,7 @@ from wlm.fluid.faces import FACES
 from wlm.fluid.lattice import CHECK_EVERY, Lattice
 from wlm.fluid.obstacles import Sphere, Trajectory, box_mesh, surface
 from wlm.fluid.slabs import Slabs
-from wlm.fluid.solver import SCHEMES, Buoyancy, Solver, Source
+from wlm.fluid.solver import SCHEMES, Buoyancy, Solver, Source, bytes_needed
 
 SHAPE = (20, 10, 10)
 NOZZLE = Source("box", (2, 5, 5), (1.5, 2.5, 2.5), 1.0, 0.5, fixed=True)
@@ -366,6 +366,8 @@ def test_too_large(device: str):
         Solver(Lattice((8, 8, 8), viscosity=0.1, device=device), refinement=200)
     with pytest.raises(WlmError, match=r"100 x 100 x 100 cells need .* GiB on .*: expected at most"):
         require_memory("smoke", (100, 100, 100), 10**15, Slabs((1, 1, 1), device))
+    # Three buffers of 64 voxels, and the traces back and ahead of a cell of air.
+    assert bytes_needed((2, 1, 1), 4, "maccormack", "float32", False, False) == 2 * (3 * 64 * 4 + 24)
 
 
 def test_a_frame_is_the_smoke_as_it_is(device: str):

@@ -1,36 +1,28 @@
 """Surfaces of a scene: triangles in world space with normals, lightmap UVs (or newly unwrapped UVs) and materials."""
 
 import copy
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image, UnidentifiedImageError
 
 from wlm.bake.settings import BakeScene, LightmapSettings
 from wlm.errors import WlmError, one_line
 from wlm.formats.gltf import (
     GltfDocument,
     GltfPrimitive,
-    held_image,
-    image_file,
     read_gltf,
     reported,
-    texture_image,
     texture_transform,
     vertex_normals,
 )
-from wlm.formats.gltf_slots import lightmap_uv, usual_set
+from wlm.formats.gltf_slots import lightmap_uv, texture_picture, usual_set
 from wlm.formats.gltf_writer import Replacement
 from wlm.formats.hdr_blocks import need
-from wlm.formats.limits import MESH_BYTES
-from wlm.formats.reading import read_file
 
 _UNWRAPPED = 1  # n of the new `TEXCOORD_n`
-_MOST_IMAGE = 1 << 26  # pixels
 _STRONGEST = 1e9  # radiance
 _LARGEST = 1e9
 _NEAREST = 0.01  # least size over distance: Mitsuba offsets ray origins by 1e-4 (1 + |position|), in float32
@@ -271,7 +263,8 @@ def _material(document: GltfDocument, number: int | None) -> Material:
     texture, uv_set, placed = None, None, np.eye(2, 3)
     if "baseColorTexture" in surface:
         used = surface["baseColorTexture"]
-        texture = _texture(document, used["index"])
+        pixels = np.asarray(texture_picture(document, used["index"]), np.float32) / np.float32(255.0)
+        texture = np.where(pixels <= 0.04045, pixels / 12.92, ((pixels + 0.055) / 1.055) ** 2.4).astype(np.float32)
         uv_set, placed = texture_transform(f"{document.path}: materials[{number}]", used)
     return Material(
         str(content.get("name", "")),
@@ -282,21 +275,3 @@ def _material(document: GltfDocument, number: int | None) -> Material:
         tuple(map(float, emission)),
         bool(content.get("doubleSided", False)),
     )
-
-
-def _texture(document: GltfDocument, number: int) -> np.ndarray:
-    where = f"{document.path}: textures[{number}]"
-    source = texture_image(document, number)
-    data = held_image(document, source)
-    if data is None:
-        data = read_file(image_file(document, source), MESH_BYTES, f"the image of {where}")
-    try:
-        with Image.open(io.BytesIO(data), formats=["PNG", "JPEG", "WEBP"]) as picture:
-            if picture.width * picture.height > _MOST_IMAGE:
-                raise WlmError(f"{where}: expected an image of at most {_MOST_IMAGE:,} pixels, found more")
-            pixels = np.asarray(picture.convert("RGB"), np.float32) / np.float32(255.0)
-    except UnidentifiedImageError as error:
-        raise WlmError(f"{where}: expected a PNG, JPEG or WebP image") from error
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise WlmError(f"{where}: expected a PNG, JPEG or WebP image: {one_line(error)}") from error
-    return np.where(pixels <= 0.04045, pixels / 12.92, ((pixels + 0.055) / 1.055) ** 2.4).astype(np.float32)

@@ -188,13 +188,21 @@ class SmokeSetup:
 
 
 def bytes_needed(
-    shape: tuple[int, int, int], scheme: str, storage: str, temperature: bool, bricks: bool, fuel: bool = False
+    air: tuple[int, int, int],
+    refinement: int,
+    scheme: str,
+    storage: str,
+    temperature: bool,
+    bricks: bool,
+    fuel: bool = False,
 ) -> int:
-    """Returns the memory that smoke takes at the start, in bytes; arguments as for `Solver`, and its cells."""
+    """Returns the memory that smoke and its traces take at the start, in bytes; arguments as for `Solver`, and the
+    cells of air."""
+    traces = ways_of(scheme) * math.prod(air) * wp.types.type_size_in_bytes(wp.vec3)
     if bricks:
-        return INDEX_BYTES * math.prod(-(-n // advection_places.BRICK) for n in shape)
-    fields = _buffers(scheme) * (1 + temperature + fuel)
-    return math.prod(shape) * fields * wp.types.type_size_in_bytes(advection.STORAGES[storage])
+        return traces + INDEX_BYTES * math.prod(-(-refinement * n // advection_places.BRICK) for n in air)
+    voxels = refinement**3 * math.prod(air) * wp.types.type_size_in_bytes(advection.STORAGES[storage])
+    return traces + voxels * _buffers(scheme) * (1 + temperature + fuel)
 
 
 class Solver:
@@ -281,7 +289,7 @@ class Solver:
         self.duration = duration
         self.shape = tuple(refinement * size for size in lattice.shape)
         self._stored = advection.STORAGES[storage]
-        needed = bytes_needed(self.shape, scheme, storage, temperature, bricks, fire is not None)
+        needed = bytes_needed(lattice.shape, refinement, scheme, storage, temperature, bricks, fire is not None)
         require_memory("smoke", self.shape, needed, lattice.slabs)
         if bricks and len(lattice.slabs.parts) > 1:
             raise ValueError("bricks: expected none on several devices, since a device computes all cells of its part")

@@ -306,8 +306,13 @@ def vertex_normals(document: GltfDocument, primitives: Sequence[GltfPrimitive]) 
         return normals
 
 
-def vertex_colours(document: GltfDocument, primitives: Sequence[GltfPrimitive]) -> list[np.ndarray]:
+def vertex_colours(
+    document: GltfDocument, primitives: Sequence[GltfPrimitive], textured: bool = False
+) -> list[np.ndarray]:
     """Returns the base colours of vertices: `COLOR_0`, or white without it, times the factor of the material.
+
+    Args:
+        textured: Whether materials may have a texture, by which the caller multiplies the colours.
 
     Returns:
         For each primitive float32 [V, 3], linear, from 0 to 1.
@@ -317,7 +322,7 @@ def vertex_colours(document: GltfDocument, primitives: Sequence[GltfPrimitive]) 
         for each in primitives:
             material = {} if each.material is None else document.item("materials", each.material)
             shading = material.get("pbrMetallicRoughness", {})
-            if "baseColorTexture" in shading:
+            if "baseColorTexture" in shading and not textured:
                 raise WlmError(
                     f"{document.path}: materials[{each.material}]: expected a base colour by its factor or COLOR_0, "
                     "found a texture; store its colours in COLOR_0"

@@ -5,15 +5,27 @@ them; others store tiling and offset there. Integer UVs take the transform of an
 of a slot for light if it keeps them in [0, 1]. A slot whose image has the name of the lightmap comes first.
 """
 
+import io
 from collections.abc import Iterator, Sequence
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image, UnidentifiedImageError
 
-from wlm.errors import WlmError
-from wlm.formats.gltf import GltfDocument, GltfPrimitive, image_file, reported, texture_image, texture_transform
+from wlm.errors import WlmError, one_line
+from wlm.formats.gltf import (
+    GltfDocument,
+    GltfPrimitive,
+    held_image,
+    image_file,
+    reported,
+    texture_image,
+    texture_transform,
+)
+from wlm.formats.limits import MESH_BYTES
+from wlm.formats.reading import read_file
 
 SLOTS = ("occlusion", "emissive")
 """Material slots that may hold a lightmap."""
@@ -23,6 +35,7 @@ IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
 
 _FLOAT = 5126
 _MOST_SLOTS = 64  # texture slots of a material that are examined
+_MOST_IMAGE = 1 << 26  # pixels
 _NEAR = 0.01  # a transform for lightmaps leaves UVs this near to [0, 1]
 
 
@@ -66,6 +79,24 @@ def lightmap_uv(document: GltfDocument, primitive: GltfPrimitive, uv_set: int) -
         return primitive.uv[uv_set]
     rows = np.array(transform).reshape(2, 3)
     return (primitive.uv[uv_set] @ rows[:, :2].T + rows[:, 2]).astype(np.float32)
+
+
+def texture_picture(document: GltfDocument, number: int) -> Image.Image:
+    """Returns the picture of a texture, in RGB of 8 bits."""
+    where = f"{document.path}: textures[{number}]"
+    source = texture_image(document, number)
+    data = held_image(document, source)
+    if data is None:
+        data = read_file(image_file(document, source), MESH_BYTES, f"the image of {where}")
+    try:
+        with Image.open(io.BytesIO(data), formats=["PNG", "JPEG", "WEBP"]) as picture:
+            if picture.width * picture.height > _MOST_IMAGE:
+                raise WlmError(f"{where}: expected an image of at most {_MOST_IMAGE:,} pixels, found more")
+            return picture.convert("RGB")
+    except UnidentifiedImageError as error:
+        raise WlmError(f"{where}: expected a PNG, JPEG or WebP image") from error
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise WlmError(f"{where}: expected a PNG, JPEG or WebP image: {one_line(error)}") from error
 
 
 def _slots(holder: Any, name: str = "") -> Iterator[tuple[str, dict[str, Any]]]:

@@ -344,7 +344,7 @@ def _require_memory(scene: Scene, slabs: Slabs) -> None:
     """Checks before the allocation that air and smoke fit into the free memory; raises a WlmError if not."""
     grid, smoke = scene.grid, scene.smoke
     smoke_bytes = fluid.bytes_needed(
-        grid.shape, smoke.scheme, smoke.storage, smoke.hot, smoke.bricks, smoke.fire is not None
+        grid.cells, grid.refine, smoke.scheme, smoke.storage, smoke.hot, smoke.bricks, smoke.fire is not None
     )
     needed = Lattice.bytes_needed(grid.cells, scene.air.storage) + smoke_bytes
     if needed > (free := slabs.free):

@@ -1,5 +1,6 @@
 """Pages in a browser: the light that they decode is that of Python, and their controls change the picture."""
 
+import base64
 import dataclasses
 import io
 import re
@@ -228,6 +229,50 @@ def test_a_texel_of_an_atlas(kind, tmp_path, show):
             assert [left, top] == first.tolist() and [wide, high] == size.tolist()
         assert ("tile" in text) == (kind == "tiles")
     assert len(seen) == 3 and (1, 2) not in seen, "three sides of the cube, and nothing of what is inside"
+
+
+def test_materials_dim_the_light_of_an_atlas(tmp_path, show):
+    mesh, pixels = (
+        atlas_meshes.sheet(atlas_meshes.constant(0.5, 0.4, 0.3)),
+        np.full((16, 16, 3), [255, 128, 0], np.uint8),
+    )
+    pixels[:, 8:] = 64
+    data = io.BytesIO()
+    Image.fromarray(pixels).save(data, "PNG")
+    content = mesh.document.content
+    content["images"] = [{"uri": f"data:image/png;base64,{base64.b64encode(data.getvalue()).decode()}"}]
+    moved = {"KHR_texture_transform": {"offset": [0.5, 0.0]}}
+    surface = {"baseColorFactor": [1.0, 0.5, 1.0, 1.0], "baseColorTexture": {"index": 0, "extensions": moved}}
+    content |= {"textures": [{"source": 0}], "materials": [{"pbrMetallicRoughness": surface}]}
+    content["meshes"][0]["primitives"][0]["material"] = 0
+    wlm.atlas.compress(mesh, wlm.atlas.Profile(name="tiny", views=2)).save(tmp_path / "sheet.wlm")
+    write_page(tmp_path / "page.html", [tmp_path / "sheet.wlm"])
+    page = show(tmp_path / "page.html")
+    box = page.locator("#view").bounding_box()
+    exposure = page.evaluate("wlm.then(({manifest}) => [manifest.exposure, manifest.bare])")
+    coloured, sides = picture(page), set()
+    page.keyboard.press("m")
+    bare = picture(page)
+    for x, y in ((0.4, 0.5), (0.45, 0.4), (0.55, 0.55), (0.6, 0.5)):
+        x, y = int(x * box["width"]), int(y * box["height"])
+        page.mouse.move(box["x"] + x + 0.5, box["y"] + y + 0.5)
+        text = told(page)
+        right = texel_of(text)[0] >= 24
+        sides.add(right)
+        # The picture is moved by half its width.
+        code = np.array([255, 128, 0] if right else [64, 64, 64]) / 255
+        base = np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4) * [1.0, 0.5, 1.0]
+        for shown, colour in ((coloured, base * exposure[0]), (bare, exposure[1])):
+            light = np.clip(light_of(text, "decoded") * colour, 0, 1)
+            light = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+            assert np.abs(shown[y, x] - 255 * light).max() <= 3
+    assert len(sides) == 2
+    assert figure(page, "materials") == "base colours of the file"
+    # A picture that the file lacks leaves the light as it is, and the page says so.
+    content["images"] = [{"uri": "wood.png"}]
+    wlm.atlas.compress(mesh, wlm.atlas.Profile(name="tiny", views=2)).save(tmp_path / "sheet.wlm")
+    write_page(tmp_path / "page.html", [tmp_path / "sheet.wlm"])
+    assert "wood.png" in figure(show(tmp_path / "page.html"), "materials")
 
 
 @pytest.fixture

@@ -14,6 +14,7 @@ from wlm.atlas.model import BLOCK_SIDE, SIDE_BITS
 from wlm.atlas.shader import glsl
 from wlm.errors import WlmError
 from wlm.export.page.html import Page, compare_sizes, pack_triangles
+from wlm.export.page.materials import pack_materials
 from wlm.formats.geometry import Geometry
 from wlm.formats.light import read_light
 from wlm.formats.shared_exponent import pack_rgb9e5
@@ -22,6 +23,7 @@ from wlm.system import load
 from wlm.texels import exposure, fill_gaps
 
 _FORMATS = {"half": "half floats", "rgb9e5": "RGB9E5", "bc6h": "BC6H", "astc": "ASTC", "mixed": "RGB9E5"}
+_DARKEST = 0.02  # mean base colour for which a page is exposed
 
 
 def atlas_page(
@@ -41,6 +43,14 @@ def atlas_page(
     drawn = Geometry(position, np.arange(len(corners), dtype=np.uint32).reshape(-1, 3), uv)
     texels = np.ascontiguousarray(colours, np.float16)
     arrays, box = pack_triangles(drawn, up)
+    shown, base = "base colours of the file", 1.0
+    try:
+        parts, base = pack_materials(model.scene.document, [part.primitive for part in mesh.parts])
+        # Vertices of the sheet are those of its primitives, in order.
+        arrays |= {name: values if name == "pictures" else values[corners] for name, values in parts.items()}
+        shown = shown if parts else "white"
+    except WlmError as error:  # light can be seen without them
+        shown = f"white: {error}"
     arrays["colour"] = texels
     if model.colour == "mixed":
         arrays["blocks"] = np.ascontiguousarray(blocks, np.float16)
@@ -53,7 +63,7 @@ def atlas_page(
         "width": width,
         "height": height,
         "shader": glsl(model),
-        "exposure": exposure(decoded[mesh.mask]),
+        "exposure": (bare := exposure(decoded[mesh.mask])) / max(base, _DARKEST),
         "atlas": {
             "method": model.method,
             "colour": texels.shape[1::-1],
@@ -66,6 +76,8 @@ def atlas_page(
         },
         **box,
     }
+    if "pictures" in arrays:
+        manifest |= {"picture": arrays["pictures"].shape[1], "bare": bare}
     scores: list[tuple[str, str]] = []
     if original is not None:
         lightmap = read_light(original)[0][..., :3]
@@ -88,10 +100,11 @@ def atlas_page(
         ("lightmap", f"{width} × {height} texels"),
         ("colour texture", f"{texels.shape[1]} × {texels.shape[0]}, {_FORMATS[model.colour]}"),
         ("method", model.method),
+        ("materials", shown),
         ("triangles", f"{len(triangles):,}"),
         ("profile", model.profile.name),
     ]
     if model.colour == "mixed":
         rows, columns = model.block_texels.shape[1:3]
-        figures.insert(-4, ("its blocks", f"{columns} × {rows}, BC6H"))
+        figures.insert(-5, ("its blocks", f"{columns} × {rows}, BC6H"))
     return Page("atlas", model.name, "A lightmap read through a table, on this GPU.", figures, manifest, arrays)

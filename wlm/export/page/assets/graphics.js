@@ -135,6 +135,15 @@ void main() { texel = texelFetch(u_blocks, ivec2(gl_FragCoord.xy), 0); }`);
     return {...result, width, height};
   }
 
+  // Makes a texture array of square sRGB pictures that repeat, with smaller levels.
+  pictures(side, values) {
+    const {gl} = this, target = gl.TEXTURE_2D_ARRAY, result = this.#texture(target, gl.LINEAR, {S: true, T: true});
+    gl.texImage3D(target, 0, gl.SRGB8_ALPHA8, side, side, values.length / (4 * side * side), 0, gl.RGBA, gl.UNSIGNED_BYTE, values);
+    gl.generateMipmap(target);
+    gl.texParameteri(target, gl.TEXTURE_MIN_FILTER, gl.LINEAR_MIPMAP_LINEAR);
+    return result;
+  }
+
   putLayer({target, texture, width, height}, layer, data) {
     const {gl} = this, place = [target, 0, 0, 0, layer, width, height, 1];
     gl.bindTexture(target, texture);

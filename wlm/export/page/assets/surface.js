@@ -5,15 +5,21 @@ const SURFACE = `${HEAD}
 in vec3 a_position;
 in vec2 a_uv;
 in vec2 a_coordinate;
+in vec3 a_tint;
+in vec3 a_picture;
 uniform mat4 u_camera;
 uniform bool u_unwrapped;
 uniform float u_aspect;
 centroid out vec2 v_uv;
 centroid out vec2 v_coordinate;
+centroid out vec3 v_tint;
+centroid out vec3 v_picture;
 void main()
 {
     v_uv = a_uv;
     v_coordinate = a_coordinate;
+    v_tint = a_tint;
+    v_picture = a_picture;
     gl_Position = u_camera * vec4(u_unwrapped ? vec3(a_uv.x * u_aspect, -a_uv.y, 0.0) : a_position, 1.0);
 }`;
 
@@ -21,12 +27,16 @@ void main()
 // charts, if the page has no array of that name.
 class Surface {
   constructor(graphics, page, source, display, panel, changed, tell, mask) {
-    const {manifest} = page;
+    const {manifest} = page, coloured = page.has('pictures');
     Object.assign(this, {graphics, display, changed, aspect: manifest.width / manifest.height});
     this.program = graphics.program(SURFACE, `${HEAD}
 centroid in vec2 v_uv;
 centroid in vec2 v_coordinate;
 uniform sampler2D u_original, u_mask;
+centroid in vec3 v_tint;
+centroid in vec3 v_picture;
+uniform sampler2DArray u_pictures;
+uniform bool u_coloured;
 uniform bool u_unwrapped;
 uniform vec3 u_paper;
 out vec4 colour;
@@ -34,7 +44,9 @@ ${source}
 ${DISPLAY}
 void main()
 {
-    colour = vec4(wlm_shown(wlm_light(), texture(u_original, v_uv).rgb), 1.0);
+    vec3 base = ${coloured ? 'v_tint * texture(u_pictures, v_picture).rgb' : 'vec3(1.0)'};
+    if (!u_coloured) base = vec3(1.0);
+    colour = vec4(wlm_shown(base * wlm_light(), base * texture(u_original, v_uv).rgb), 1.0);
     // Texels outside charts are not visible on the mesh, and are in no score: there the page is seen.
     if (u_unwrapped && texture(u_mask, v_uv).r == 0.0) colour.rgb = u_view == ${VIEWS.indexOf('error')} ? vec3(0.3) : u_paper;
 }`);
@@ -47,9 +59,15 @@ void main()
     // Whether light is read at other coordinates than the lightmap's UV.
     this.apart = page.has('coordinate');
     const coordinate = this.apart ? page.array('coordinate', Float32Array) : uv;
-    this.geometry = graphics.geometry(this.program, {
-      a_position: [3, position], a_uv: [2, uv], a_coordinate: [2, coordinate],
-    }, indices);
+    const attributes = {a_position: [3, position], a_uv: [2, uv], a_coordinate: [2, coordinate]};
+    if (coloured) {
+      for (const name of ['tint', 'picture']) attributes[`a_${name}`] = [3, page.array(name, Float32Array)];
+      this.pictures = graphics.pictures(manifest.picture, page.array('pictures', Uint8Array));
+      this.coloured = true;
+      const {exposure, bare} = manifest;
+      panel.toggle('materials', 'm', true, (on) => { this.coloured = on; display.expose(on ? exposure : bare); });
+    }
+    this.geometry = graphics.geometry(this.program, attributes, indices);
     const canvas = graphics.canvas;
     this.picture = new Camera(canvas, [0, -1, 0], [this.aspect, 0, 0], {flat: true, changed});
     this.mesh = page.has('position') ? new Camera(canvas, manifest.low, manifest.high, {up: manifest.up, changed}) : null;
@@ -89,7 +107,7 @@ void main()
     const {graphics} = this, {width} = graphics.begin();
     graphics.use(this.program, {
       ...uniforms, ...this.display.uniforms(width), ...this.shape(), u_mask: this.mask, u_paper: graphics.paper,
-      u_original: original ?? graphics.black,
+      u_pictures: this.pictures, u_coloured: Boolean(this.coloured && !this.unwrapped), u_original: original ?? graphics.black,
     });
     graphics.drawGeometry(this.geometry, 1, this.culled);
     this.reading.show();
