@@ -97,8 +97,8 @@ def run(
     parts = {"background": looks.background, "ramp": looks.ramp, "obstacles": looks.obstacles}
     drawing = Drawing(camera, lights, albedo=looks.albedo, **parts, device=device)
     graph = None
-    # A network waits for the device, which a graph cannot capture.
-    if lighting.network is None and device != "cpu":
+    # A network waits for the device, which a graph cannot capture; nor can it follow a number of bricks.
+    if lighting.network is None and device != "cpu" and not scene.smoke.bricks:
         # The frames before have loaded the kernels.
         graph = VolumeGraph(lambda volume: drawing(lighting(volume, camera, lights, drawing)), device, warmup=1)
     smoke = False
@@ -107,7 +107,7 @@ def run(
         clock = _Clock(device)
         advance(scene, solver, number)
         solver.check()
-        volume = volume_of(scene, solver)
+        volume = volume_of(scene, solver, dense=False)
         clock.stop(SIMULATION)
         drawing.move(scene.time(number))
         if graph is not None and number > _STAGED:

@@ -22,10 +22,10 @@ from wlm_kernels.smoke.march import (
     Medium,
     Solid,
     between_nodes,
+    box_of,
     clip,
     for_smoke,
     sample,
-    size_of,
     way_to_solid,
 )
 from wlm_kernels.smoke.settings import March
@@ -170,7 +170,7 @@ def _measure(smoke_type: Any, pairs: int) -> wp.Kernel:
         """Computes the optical depth from a node to the next node along the axis of each pair of opposite lights."""
         i, j, k = wp.tid()
         begin = _node(lattice, i, j, k)
-        size = size_of(smoke.density)
+        size = box_of(smoke)
         for pair in range(wp.static(pairs)):
             tau = float(0.0)
             if wp.where(pair == 0, i, j) < wp.where(pair == 0, gaps.shape[1], gaps.shape[2]) - 1:
@@ -202,7 +202,7 @@ def _reach(smoke_type: Any) -> wp.Kernel:
         p = _node(lattice, i, j, k)
         away = wp.length(lattice.place - p)
         toward = wp.normalize(lattice.place - p)
-        span = clip(size_of(smoke.density), p, toward)
+        span = clip(box_of(smoke), p, toward)
         first = wp.max(span[0], 0.0)
         last = wp.min(span[1], away)
         tau = float(0.0)
@@ -286,7 +286,7 @@ def reach(medium: Medium, place: Sequence[float], radius: float | None, march: M
     a point light 0.
     """
     spacing, step = spacing_of(march)
-    shape = medium.density.shape
+    shape = medium.shape
     if radius is None:
         lattice, counts = make_lattice(shape, _axes(place), spacing)
         return lattice, add_up(medium, lattice, counts, 1, step).reshape(counts)

@@ -21,6 +21,7 @@ from wlm_kernels.smoke.march import (
     Medium,
     View,
     absorbed,
+    box_of,
     clip,
     density_at,
     for_smoke,
@@ -30,7 +31,6 @@ from wlm_kernels.smoke.march import (
     ray,
     require_orthographic,
     sample,
-    size_of,
 )
 from wlm_kernels.smoke.settings import March
 
@@ -71,7 +71,7 @@ def _column(smoke_type: Any) -> wp.Kernel:
     ):
         row, col = wp.tid()
         r = ray(view, row, col)
-        span = clip(size_of(smoke.density), r.origin, r.direction)
+        span = clip(box_of(smoke), r.origin, r.direction)
         total = float(0.0)
         for n in range(slab.planes):
             s = slab.start + (float(n) + 0.5) * slab.gap
@@ -111,7 +111,7 @@ def _sweep(smoke_type: Any) -> wp.Kernel:
         if along == 1 or along == 3:
             toward = -toward
         # Distances towards the light; the pixels lie at (k + 1/2 - count / 2) pitch, k falling.
-        span = clip(size_of(smoke.density), base, toward)
+        span = clip(box_of(smoke), base, toward)
         dt = view.pitch / float(parts)
         total = float(0.0)
         top = (0.5 * float(count) - 0.5) * view.pitch
@@ -158,7 +158,7 @@ def _gather(smoke_type: Any) -> wp.Kernel:
     ):
         row, col = wp.tid()
         r = ray(view, row, col)
-        span = clip(size_of(smoke.density), r.origin, r.direction)
+        span = clip(box_of(smoke), r.origin, r.direction)
         side = phase(march.g, 0.0)
         front = phase(march.g, -1.0) * wp.exp(-behind[row, col])
         back = phase(march.g, 1.0) * wp.exp(-ahead[row, col])
@@ -183,7 +183,7 @@ def _gather(smoke_type: Any) -> wp.Kernel:
                     # ways to the camera and to the light add up to the whole ray.
                     b += wp.vec3(front * t * t * 0.5 * absorbed(2.0 * x), back * x, 0.0)
                 if smoke.emission > 0.0:
-                    hot = smoke.emission * density_at(smoke.temperature, p) * slab.gap
+                    hot = smoke.emission * density_at(smoke.temperature, smoke, p) * slab.gap
                     b += wp.vec3(0.0, 0.0, hot * t * mean_transparency(x))
                 tau += x
         passed[row, col] = tau
@@ -222,7 +222,7 @@ def six_way(medium: Medium, view: View, march: March, out: wp.array) -> None:
     medium = medium.in_bricks()
     height, width = view.height, view.width
     out.zero_()
-    near, far = _extent(medium.density.shape, view.origin, view.forward)
+    near, far = _extent(medium.shape, view.origin, view.forward)
     start = max(near, 0.0)
     passed, behind, ahead = (medium.buffer((height, width), float) for _ in range(3))
     passed.zero_()

@@ -22,6 +22,7 @@ from wlm_kernels.smoke.march import (
     begin,
     begin_jittered,
     between_nodes,
+    box_of,
     emitted,
     for_smoke,
     halves,
@@ -33,7 +34,6 @@ from wlm_kernels.smoke.march import (
     phase,
     pixel_of,
     require_orthographic,
-    size_of,
     surface,
 )
 from wlm_kernels.smoke.settings import March
@@ -223,7 +223,7 @@ def coarse_six_way(medium: Medium, view: View, march: March, out: wp.array) -> N
     if march.step < BRICK:
         medium = medium.in_bricks()
     spacing, light_step = spacing_of(march)
-    lattice, counts = make_lattice(medium.density.shape, (view.right, view.up, view.forward), spacing, view.origin)
+    lattice, counts = make_lattice(medium.shape, (view.right, view.up, view.forward), spacing, view.origin)
     nodes = add_up(medium, lattice, counts, 2, light_step)
     hot = medium.temperature is not None
     _coarse(medium, in_tiles(*out.shape[1:]), [nodes, view, lattice, parameters(march)], [out], hot)
@@ -345,7 +345,7 @@ def _motion(smoke_type: Any) -> wp.Kernel:
         if row >= view.height or column >= view.width:
             return
         r = begin(view, row, column, smoke, march.step, 0.5)
-        size = size_of(smoke.density)
+        size = box_of(smoke)
         cells = wp.vec3(float(velocity.shape[0]), float(velocity.shape[1]), float(velocity.shape[2]))
         share = wp.cw_div(cells, size)
         border = wp.vec3(_BORDER, _BORDER, _BORDER)

@@ -36,7 +36,12 @@ def medium_of(volume: DensityVolume) -> Medium:
     """Returns the smoke as the structure that march kernels take; must be called inside `wlm.interop.stream`."""
     density, temperature = volume.arrays()
     factors = (volume.extinction * volume.voxel, temperature, volume.emission * volume.voxel)
-    return Medium(density, *factors, empty=torch_memory(volume.device))
+    bricks: dict[str, Any] = {}
+    if volume.places is not None:
+        # A sample reads up to half a voxel beyond its brick.
+        near = torch.nn.functional.max_pool3d((volume.places > 0).float()[None, None], 3, 1, 1)[0, 0]
+        bricks = {"bricks": to_warp(near.byte()), "places": to_warp(volume.places), "cells": volume.shape}
+    return Medium(density, *factors, empty=torch_memory(volume.device), **bricks)
 
 
 _Made = TypeVar("_Made")
