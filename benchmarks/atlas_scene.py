@@ -9,6 +9,8 @@ The results table has a row of method "scene" for each profile: file size, times
 error in views of the whole scene. A row of method "parts" follows it: every object in every state is compressed alone
 by the profile `standard` (`benchmarks.rivals.scene_parts`), in the same total number of bits or a few more.
 
+The row of method "copies" bounds what tiles that copy another object's tile could gain (`benchmarks.atlas_affine`).
+
 "gain" is the mean PSNR of the scene's model over views and states, minus the mean PSNR of the parts; "least gain" is
 this difference in the state where it is smallest.
 """
@@ -24,6 +26,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from benchmarks.atlas import make_square
+from benchmarks.atlas_affine import affine_gain
 from benchmarks.rivals.scene_parts import scene_parts
 from benchmarks.rows import Row
 from benchmarks.runner import Bench, Note
@@ -152,6 +155,10 @@ class _SceneBench(Bench):
             notes = f"each object and state alone, {plain} of them plain smaller lightmaps; no file"
             sizes_of_parts = {"bpp": self._bpp(alone.bits), "compression_ratio": 1.0 - share}
             rows.append(self.row("parts", f"bits of {profile.name}", notes, **sizes_of_parts))
+            self.note("matching tiles of different objects")
+            gain, copied = affine_gain(scene, weights, share, device)
+            notes = f"an upper bound; {copied:.0%} of the tiles would be copies"
+            copies = self.row("copies", f"gain and offset, bits of {profile.name}", notes, gain=gain)
         self.note("measuring errors in views")
         scores = compare(scene, decoders, device=device, **self._views)
         for number, name in enumerate(scores):
@@ -161,6 +168,7 @@ class _SceneBench(Bench):
             gains = np.subtract(*(scores[name].psnr_by_state for name in ("scene", "parts")))
             gain = scores["scene"].psnr - scores["parts"].psnr
             rows[0] = rows[0].with_figures(gain=gain, gain_min=float(np.nanmin(gains)))
+            rows.append(copies)
         return rows
 
     def _bpp(self, bits: float) -> float:

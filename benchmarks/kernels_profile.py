@@ -36,7 +36,7 @@ _STALLS = {
     "barrier": "other warps at a barrier",
     "membar": "a memory barrier",
     "wait": "results of arithmetic",
-    "branch_resolve": "branches",
+    "branch_resolving": "branches",
     "no_instruction": "code",
     "imc_miss": "constants",
     "drain": "stores at its end",
@@ -91,7 +91,7 @@ def summarise(make: Callable[..., Row], case: str, launches: Iterable[Mapping[st
         found, time = kernels[kernel], times[kernel]
 
         def mean(column: str, found: list = found, time: float = time) -> float:
-            return sum(_number(each[column]) * _number(each[_TIME]) for each in found) / max(time, 1e-9)
+            return sum(_number(each.get(column, "")) * _number(each[_TIME]) for each in found) / max(time, 1e-9)
 
         figures = {name: mean(column) / 100.0 for name, column in _FIGURES.items()}
         stalls = {words: mean(_column(name)) for name, words in _STALLS.items()}

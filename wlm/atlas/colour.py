@@ -48,9 +48,10 @@ def quantise(
     return {"texels": texels.clip(0.0, HALF_MAX).astype(np.float16)}
 
 
-def stored(samples: torch.Tensor, weight: torch.Tensor, colour: str) -> torch.Tensor:
+def stored(samples: torch.Tensor, weight: torch.Tensor | None, colour: str) -> torch.Tensor:
     """Returns the samples of T tiles after encoding and decoding, float32 [T, ny, nx, 3], at least 0; for block formats
-    ny and nx are multiples of 4. For half floats, whose rounding is too small to matter, samples stay as they are.
+    ny and nx are multiples of 4. BC6H weights their squared errors by `weight` [T, ny, nx], which other formats ignore.
+    For half floats, whose rounding is too small to matter, samples stay as they are.
     """
     if colour == "half":
         return samples

@@ -16,6 +16,7 @@ from wlm.cli.smoke_options import (
     FrameOptions,
     Input,
     Lights,
+    Network,
     SmokeOptions,
     White,
     check_white,
@@ -36,7 +37,7 @@ __all__ = ["INSTEAD", "app", "evaluate", "info"]
 INSTEAD = {
     "compress": "wlm smoke bake or predict, which make six-way lightmaps of smoke",
     "decode": "wlm smoke predict SMOKE --network FILE",
-    "export": "wlm smoke export-onnx FILE",
+    "export": "wlm smoke export-onnx FILE or export-three FILE",
 }
 _WARM = 2  # first frames of `run`, which compile kernels and are not timed if there are others
 
@@ -179,10 +180,7 @@ def predict(
     smoke: Input,
     output: _Lightmaps,
     options: FrameOptions,
-    network: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help='Network: a file of wlm smoke train, or "fast", which ships with wlm.'),
-    ] = None,
+    network: Network = None,
     seed: Seed = 0,
 ) -> None:
     """Predict six-way lightmaps by a coarse ray march: like bake, in less time.
@@ -307,13 +305,7 @@ def run(
         ),
     ] = None,
     albedo: _Albedo = None,
-    network: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help='Network for six-way lightmaps, "fast" or a file of wlm smoke train; default a coarse march.',
-        ),
-    ] = None,
+    network: Network = None,
     white: White = 1.0,
     device: Device = "cpu",
 ) -> None:

@@ -15,10 +15,16 @@ if TYPE_CHECKING:
     from wlm.smoke.model import SmokeModel
 
 
+_Network = Annotated[
+    Path | None, typer.Argument(metavar="NETWORK", help="Network that wlm smoke train wrote; default the shipped one.")
+]
+
+
 def register(app: typer.Typer) -> None:
-    """Adds the commands `train` and `export-onnx` to the group `wlm smoke`."""
+    """Adds the commands `train`, `export-onnx` and `export-three` to the group `wlm smoke`."""
     app.command(cls=Generated)(train)
     app.command("export-onnx")(export_onnx)
+    app.command("export-three")(export_three)
 
 
 @with_settings("wlm.smoke:Profile")
@@ -71,10 +77,7 @@ def train(
 
 def export_onnx(
     output: Annotated[Path, opt.output_option("NETWORK.onnx", "The file to write.")],
-    network: Annotated[
-        Path | None,
-        typer.Argument(metavar="NETWORK", help="Network that wlm smoke train wrote; default the shipped one."),
-    ] = None,
+    network: _Network = None,
     resolution: Annotated[
         int, typer.Option(min=1, max=16384, help="Height and width of the network's images in pixels.")
     ] = 512,
@@ -91,6 +94,17 @@ def export_onnx(
     size = onnx_file.export_onnx(model, output, height=resolution, width=resolution)
     facts = {"input planes": " ".join(GUIDES[model.settings.guide]), "output planes": " ".join(PLANES)}
     console.show_facts(str(output), facts | {"image": f"{resolution} x {resolution} pixels", "bytes": size})
+
+
+def export_three(
+    output: Annotated[Path, opt.output_option("FOLDER", "The folder to write.")], network: _Network = None
+) -> None:
+    """Write a kit for three.js as a folder, which lights smoke live by a network."""
+    console.quiet_warp()
+    from wlm.export import export
+    from wlm.smoke.codec import open_network
+
+    console.show_files(output, export(open_network(network), output, "three"))
 
 
 def evaluate(

@@ -34,6 +34,23 @@ Lights = Annotated[
         help="Light, repeatable: direction from the smoke to it, and irradiance, one number or three; default 4 pi.",
     ),
 ]
+Network = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE",
+        help='Network for six-way lightmaps, "fast" or a file of wlm smoke train; default a coarse march.',
+    ),
+]
+VolumeSettings = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--volume",
+        metavar="NAME=VALUE",
+        help="Volume setting, repeatable: up=x|y|z, the upward axis of the file; extinction=PER_LENGTH at density "
+        "1; emission=PER_LENGTH at temperature 1, or 1,500 kelvins; kelvin=yes|no, the unit of temperatures; "
+        "density=GRID and temperature=GRID, names of the grids.",
+    ),
+]
 Input = Annotated[
     Path, typer.Argument(metavar="SMOKE", help="A volume (.npz, .nvdb, .vdb) or a folder of numbered volumes.")
 ]
@@ -54,34 +71,16 @@ class SmokeOptions:
             "axis; extent=HEIGHT of the image in world units; distance=LENGTH to the target; perspective=true.",
         ),
     ] = None
-    volume: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="NAME=VALUE",
-            help="Volume setting, repeatable: up=x|y|z, the upward axis of the file; extinction=PER_LENGTH at density "
-            "1; emission=PER_LENGTH at temperature 1, or 1,500 kelvins; kelvin=yes|no, the unit of temperatures; "
-            "density=GRID and temperature=GRID, names of the grids.",
-        ),
-    ] = None
+    volume: VolumeSettings = None
     trust: Trust = False
     device: Device = "cpu"
 
     def open(self, smoke: Path, device: str | None = None) -> "Frames":
         """Opens a volume or a folder of frames, whose volumes are read to a device; None: that of the options."""
-        from wlm.fluid.grids import UPS
         from wlm.interop import check_device
         from wlm.smoke.data import load_frames
 
-        settings: dict[str, Any] = _pairs("--volume", self.volume, _VOLUME)
-        if settings.get("up", "y") not in UPS:
-            raise WlmError(f"--volume up: expected one of {', '.join(UPS)}, got {settings['up']!r}")
-        for name in ("extinction", "emission"):
-            if name in settings:
-                settings[name] = _float(f"--volume {name}", settings[name])
-        if settings.get("kelvin", "yes") not in ("yes", "no"):
-            raise WlmError(f"--volume kelvin: expected yes or no, got {settings['kelvin']!r}")
-        if "kelvin" in settings:
-            settings["kelvin"] = settings["kelvin"] == "yes"
+        settings = parse_volume(self.volume)
         frames = load_frames(smoke, **settings, trust=self.trust or None, device=check_device(device or self.device))
         note_warnings(frames.warnings)
         return frames
@@ -108,6 +107,23 @@ class FrameOptions(SmokeOptions, PlaceOptions):
     """Options of work on frames, which workers may share."""
 
     resume: Resume = False
+
+
+def parse_volume(texts: Sequence[str] | None) -> dict[str, Any]:
+    """Parses the texts of `--volume` to options of `wlm.smoke.data.load_frames`."""
+    from wlm.fluid.grids import UPS
+
+    settings: dict[str, Any] = _pairs("--volume", texts, _VOLUME)
+    if settings.get("up", "y") not in UPS:
+        raise WlmError(f"--volume up: expected one of {', '.join(UPS)}, got {settings['up']!r}")
+    for name in ("extinction", "emission"):
+        if name in settings:
+            settings[name] = _float(f"--volume {name}", settings[name])
+    if settings.get("kelvin", "yes") not in ("yes", "no"):
+        raise WlmError(f"--volume kelvin: expected yes or no, got {settings['kelvin']!r}")
+    if "kelvin" in settings:
+        settings["kelvin"] = settings["kelvin"] == "yes"
+    return settings
 
 
 def _pairs(option: str, texts: Sequence[str] | None, names: Sequence[str]) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from rich.markup import escape
 
 from wlm.cli.console import check_output, quiet_warp, running, show, table
 from wlm.cli.options import Key, Original, SceneFile, Time, Up, output_option
+from wlm.cli.smoke_options import Network, VolumeSettings, parse_volume
 from wlm.errors import WlmError
 
 
@@ -17,8 +18,9 @@ def web(
         list[Path] | None,
         typer.Argument(
             metavar="[FILE...]",
-            help="A .wlm of lightmaps, meshes or probes; six-way lightmaps (.exr, one per frame, or a folder); or a "
-            "scene (.yaml). Without a file, the page is a viewer that opens such files in the browser.",
+            help="A .wlm of lightmaps, meshes or probes; six-way lightmaps (.exr, one per frame, or a folder); smoke "
+            "(.npz, .nvdb or .vdb, or a folder of frames), lit in the browser; or a scene (.yaml). Without a file, the "
+            "page is a viewer that opens such files in the browser, but for scenes and smoke.",
         ),
     ] = None,
     mesh: SceneFile = None,
@@ -29,6 +31,8 @@ def web(
         int, typer.Option(min=1, help="Most original lightmaps in the page, evenly spread over the times.")
     ] = 6,
     rate: Annotated[float, typer.Option(help="Frames per second at which smoke is played.")] = 30.0,
+    network: Network = None,
+    volume: VolumeSettings = None,
     up: Up = "y",
 ) -> None:
     """Write one HTML file that decodes and shows the light on the GPU of a browser. It works without a network."""
@@ -36,7 +40,8 @@ def web(
     quiet_warp()
     from wlm.export import write_page, write_viewer
 
-    options = {"mesh": mesh, "original": original, "key": key, "time": time}
+    options = {"mesh": mesh, "original": original, "key": key, "time": time, "network": network}
+    options["volume"] = parse_volume(volume) or None
     if files:
         with running("page") as progress:
             size = write_page(output, files, **options, hours=hours, rate=rate, up=up, progress=progress)

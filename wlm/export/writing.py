@@ -35,6 +35,7 @@ _KITS = {
     "atlas": "wlm.export.engines.atlas",
     "probe": "wlm.probe.engines.{engine}",
     "smoke": "wlm.export.engines.smoke",
+    "smoke-network": "wlm.export.engines.smoke",
 }
 """Module of each system, whose function `write_kit` writes a bundle for an engine; probes have one per engine.
 

@@ -199,6 +199,11 @@ class Trainer:
         for key, view in self.views.items():
             setattr(maps, key, interop.to_warp(view, types.get(key, wp.float32)))
         self._maps = maps
+        # The maps on the levels of the file, which a step reads once they are quantised.
+        self._rounded = features.Maps()
+        self._rounded.ut, self._rounded.vt = maps.ut, maps.vt
+        for key in ("uv_endpoints", "uv_weights", "uvt_endpoints", "uvt_weights"):
+            setattr(self._rounded, key, wp.empty_like(getattr(maps, key)))
 
         self._lanes = lanes = 1 if self._cuda else CPU_LANES
         parts = self._samples // lightmap_step.BLOCK if self._cuda else lanes
@@ -332,12 +337,17 @@ class Trainer:
         self._update(move_maps)
 
     def _add_gradients(self, quantised: bool) -> None:
-        self.batch.quantised = int(quantised)
+        maps = self._maps
+        self.batch.quantised = 0
+        if quantised:
+            self.batch.quantised, maps = 2, self._rounded
+            for pair in (("uv_endpoints", "uv_weights"), ("uvt_endpoints", "uvt_weights")):
+                blocks.round_to_levels(*(getattr(each, name) for each in (self._maps, maps) for name in pair))
         on_levels = quantised and self._integers
         if on_levels:
             levels.put_on_levels(*self._levels_args)
         hidden, output = self._nets[on_levels]
-        args = (self._maps, self._offsets, hidden, output, self.batch, self._samples, *self._launch_sums)
+        args = (maps, self._offsets, hidden, output, self.batch, self._samples, *self._launch_sums)
         span = self._samples // self._lanes
         self._share(lambda lane: self._kernels.launch(*args, lane * span, span))
 

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+import numpy as np
 from torch import nn
 
 from wlm.bundle import Bundle
@@ -45,8 +46,14 @@ class SmokeModel(Model):
         return check_settings(DatasetSettings, self.summary["dataset"], "summary.dataset.")
 
     def bundle(self, device: str = "cpu", **_: object) -> Bundle:
-        """Always raises a WlmError, since a network has no textures to export; use `wlm.smoke.export_onnx`."""
-        raise WlmError("a network has no textures: export it with export_onnx, or bundle a flip book of its lightmaps")
+        """Returns the weights as half floats, one after the other, and in the document their shapes, the settings, the
+        names of the planes, and those settings of the training samples by which guiding maps are marched."""
+        settings, weights, _source = self._encoded()
+        shapes = {name: weight.shape for name, weight in weights.items()}
+        look = self.dataset.model_dump(include={"guide_step", "guide_spacing", "surface", "jitter"})
+        document = {"settings": settings["network"], "names": self.network.names, "shapes": shapes, "look": look}
+        buffers = {"weights": np.concatenate([weight.ravel() for weight in weights.values()])}
+        return Bundle(self.SYSTEM, "network", "", document, buffers=buffers)
 
 
 def parameter_count(network: nn.Module) -> int:

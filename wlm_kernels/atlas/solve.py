@@ -4,7 +4,7 @@ The light at m x m points of a tile is interpolated bilinearly from nx x ny samp
 sample only with its eight neighbours, so they are computed from the points once, and conjugate gradients then iterate
 over samples.
 
-Arrays may have any strides; on CUDA the stride along the tiles should be 1, which is fastest.
+Arrays may have any strides; on CUDA the stride along the tiles, which neighbouring threads have, should be 1.
 """
 
 import warp as wp
@@ -110,7 +110,7 @@ def _solve(
     image: wp.array3d[float],
     out: wp.array3d[float],
 ):
-    t, channel = wp.tid()
+    channel, t = wp.tid()
     count = grid.nx * grid.ny
     # The residual of the start is transposed to the samples; differences are formed at the points, since
     # differences of large sums would lose precision.
@@ -192,7 +192,7 @@ def _errors(
     samples: wp.array3d[float],
     out: wp.array2d[wp.float64],
 ):
-    t, channel = wp.tid()
+    channel, t = wp.tid()
     total = wp.float64(0.0)
     for r in range(grid.points):
         i = grid.first_y[r] * grid.nx
@@ -237,11 +237,11 @@ def solve(
     `ridge`. `work` are three arrays of the same shape, scratch memory.
     """
     inputs = [light, weight, scale, grid, system, ridge, rounds, start, *work, out]
-    wp.launch(_solve, light.shape[:2], inputs=inputs, device=light.device, block_dim=_BLOCK)
+    wp.launch(_solve, light.shape[1::-1], inputs=inputs, device=light.device, block_dim=_BLOCK)
 
 
 def errors(light: wp.array, weight: wp.array, grid: Grid, samples: wp.array, out: wp.array) -> None:
     """Writes the weighted squared errors of samples, float [T, 3, S], summed over each tile's points, to `out`, float64
     [T, 3]; `light` and `weight` are as for `solve`."""
     inputs = [light, weight, grid, samples, out]
-    wp.launch(_errors, light.shape[:2], inputs=inputs, device=light.device, block_dim=_BLOCK)
+    wp.launch(_errors, light.shape[1::-1], inputs=inputs, device=light.device, block_dim=_BLOCK)

@@ -4,9 +4,10 @@ A map of 4 channels is cut into blocks of 4x4 texels. A block has two endpoints 
 weight in [0, 1] per texel; a texel is `(1 - w) e0 + w e1` (neural-dynamic-gi, eq. 7 and 8). BC7 mode 6 stores the
 endpoints with 7 bits a channel plus one lowest bit shared by the four channels, and the weights with 4 bits.
 
-With `quantised`, endpoints and weights are rounded to these levels, so that training sees the texels of the file. The
+With `quantised` 1, endpoints and weights are rounded to these levels, so that training sees the texels of the file. The
 adjoint is straight-through: each rounding has derivative 1, and values outside [0, 1] keep their gradient, so that Adam
-can bring them back. `benchmarks.plain.bc7_texels` is the same in a few lines of torch.
+can bring them back. 2 stands for endpoints and weights that `round_to_levels` has rounded before: a step of a fit reads
+most of them many times. `benchmarks.plain.bc7_texels` is the same in a few lines of torch.
 
 Arrays: endpoints `[S, H/4, W/4, 2]` of vec4, weights `[S, H, W]`, where S counts slices (tiles, or tiles x
 times). Blocks of the file are `[S, H/4, W/4, 2]` of uint64, the low and the high half of 16 little-endian bytes.
@@ -31,7 +32,7 @@ def index_level(index: int) -> int:
 @wp.func
 def ste_weight(w: float, quantised: int) -> float:
     """Returns w clamped to [0, 1], or if quantised the nearest BC7 weight. The adjoint treats the derivative as 1."""
-    if quantised == 0:
+    if quantised != 1:
         return wp.clamp(w, 0.0, 1.0)
     return float(index_level(weight_index(w))) / 64.0
 
@@ -63,7 +64,7 @@ def endpoint_byte(e: wp.vec4) -> wp.vec4:
 @wp.func
 def ste_endpoint(e: wp.vec4, quantised: int) -> wp.vec4:
     """Returns e clamped to [0, 1], or if quantised its stored bytes / 255. The adjoint treats the derivative as 1."""
-    if quantised == 0:
+    if quantised != 1:
         return wp.vec4(
             wp.clamp(e[0], 0.0, 1.0),
             wp.clamp(e[1], 0.0, 1.0),
@@ -180,6 +181,21 @@ def _reconstruct_backward(
 
 
 @wp.kernel
+def _round_to_levels(
+    # in:
+    endpoints: wp.array4d[wp.vec4],
+    weights: wp.array3d[float],
+    # out:
+    endpoints_out: wp.array4d[wp.vec4],
+    weights_out: wp.array3d[float],
+):
+    s, y, x = wp.tid()
+    weights_out[s, y, x] = ste_weight(weights[s, y, x], 1)
+    if x % 4 == 0 and y % 4 < 2:  # two of a block's texels write one endpoint each
+        endpoints_out[s, y // 4, x // 4, y % 4] = ste_endpoint(endpoints[s, y // 4, x // 4, y % 4], 1)
+
+
+@wp.kernel
 def _quantise(
     # in:
     endpoints: wp.array4d[wp.vec4],
@@ -222,6 +238,18 @@ def reconstruct_backward(endpoints, weights, grad_out, grad_endpoints, grad_weig
     inputs = [endpoints, weights, int(quantised), grad_out]
     outputs = [grad_endpoints, grad_weights]
     wp.launch(_reconstruct_backward, endpoints.shape[:3], inputs=inputs, outputs=outputs, device=weights.device)
+
+
+def round_to_levels(endpoints, weights, endpoints_out, weights_out) -> None:
+    """Rounds endpoints and weights to the values that BC7 mode 6 can store.
+
+    Args:
+        endpoints: vec4 [S, H/4, W/4, 2], in [0, 1].
+        weights: float [S, H, W], in [0, 1].
+        endpoints_out, weights_out: Arrays of the same shapes, written.
+    """
+    inputs, outputs = [endpoints, weights], [endpoints_out, weights_out]
+    wp.launch(_round_to_levels, weights.shape, inputs=inputs, outputs=outputs, device=weights.device)
 
 
 def quantise(endpoints, weights, bytes_out, index_out) -> None:

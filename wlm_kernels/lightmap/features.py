@@ -126,7 +126,7 @@ class Batch:
     spread: wp.array1d[wp.vec3]  # [N]
     emphasis: float  # exponent of the colour over scale in the weight of a texel; 0: none
     periodic: int
-    quantised: int
+    quantised: int  # as in `wlm_kernels.lightmap.blocks`
 
 
 @wp.func

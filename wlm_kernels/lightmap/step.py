@@ -170,7 +170,9 @@ def step_kernels(hidden: int, gelu: str, device_kind: str) -> StepKernels:
         scatter_plane(acc, lane, offsets.ut, rows, columns, n, u, tau, batch.periodic, c * wp.vec2(g[8], g[9]))
         scatter_plane(acc, lane, offsets.vt, rows, columns, n, v, tau, batch.periodic, c * wp.vec2(g[10], g[11]))
 
-    options = {"enable_backward": False}
+    # The depth is LLVM's own, at which it finds the vectors of the network; Warp's default of 4 does not.
+    flags = "-march=native -mllvm=-inline-threshold=9000 -mllvm=-slp-recursion-max-depth=12"
+    options = {"enable_backward": False, "cpu_compiler_flags": flags}
 
     @wp.kernel(module="unique", module_options=options)
     def draw(

@@ -402,26 +402,20 @@ def test_smoke_is_shaded_as_in_python(tmp_path, show):
     maps = np.stack([0.1 + 0.1 * i + 0.2 * rows * columns for i in range(6)]).astype(np.float32)
     camera = Camera.look_at((0.0, 0.0, 1.0), np.zeros(3), extent=1.0, height=32, width=32)
     six = SixWay(torch.from_numpy(maps), torch.full((32, 32), 0.0), camera=camera)
-    for number in range(2):
-        write_six_way(tmp_path / f"{number}.exr", six)
-    write_page(tmp_path / "page.html", [tmp_path / "0.exr", tmp_path / "1.exr"], rate=10.0)
+    write_six_way(tmp_path / "0.exr", six)
+    write_page(tmp_path / "page.html", [tmp_path / "0.exr"])
     page = show(tmp_path / "page.html", width=700, height=400)
     for toward in ((1.0, 0.0, 0.0), (-0.6, 0.0, 0.8), (0.0, 0.6, -0.8)):
-        page.evaluate(
-            f"wlm.then(({{kind}}) => {{ kind.toward = {list(toward)}; kind.draw(); kind.camera.changed(); }})"
-        )
+        page.evaluate(f"wlm.then(({{kind}}) => {{ kind.toward = {list(toward)}; kind.camera.changed(); }})")
         exposure = page.evaluate("wlm.then(({manifest}) => manifest.exposure)")
         light = six.shade([Light(toward)]).numpy()[16, 16] * exposure
         expected = 255 * (1.055 * min(light[0], 1.0) ** (1 / 2.4) - 0.055)
         seen = picture(page)
-        at = seen[seen.shape[0] // 2, seen.shape[1] // 2]
-        assert np.abs(at - expected).max() <= 4
-    before = picture(page)
-    box = page.locator("#view").bounding_box()
+        assert np.abs(seen[seen.shape[0] // 2, seen.shape[1] // 2] - expected).max() <= 4
+    before, box = picture(page), page.locator("#view").bounding_box()
     page.mouse.move(box["x"] + 20, box["y"] + 200)
     page.mouse.down()
     page.mouse.move(box["x"] + 60, box["y"] + 220)
-    page.mouse.up()
     assert np.abs(picture(page) - before).max() > 5
 
 

@@ -198,10 +198,10 @@ def _folded(weight: torch.Tensor, points: int) -> torch.Tensor:
     return padded
 
 
-def solve(tiles: Tiles, nx: int, ny: int, rounds: int = _FINE) -> torch.Tensor:
+def solve(tiles: Tiles, nx: int, ny: int, rounds: int = _FINE, columns: torch.Tensor | None = None) -> torch.Tensor:
     """Returns the samples of least weighted squared error, float [T, ny, nx, 3], for tiles that all have nx x ny
     samples, by at most `rounds` iterations of conjugate gradients on the normal equations of each tile and channel,
-    starting from the solution for equal weights."""
+    starting from the solution for equal weights. `columns` is from `fitted_columns` for `ny`, None to compute it."""
     with on_stream(tiles.light.device):
         grid, space = _grid(tiles, nx, ny), functools.partial(_empty, tiles)
         light, weight = (interop.to_warp(_laid_out(values)) for values in (tiles.light, tiles.weight))
@@ -212,8 +212,8 @@ def solve(tiles: Tiles, nx: int, ny: int, rounds: int = _FINE) -> torch.Tensor:
         )
         kernels.gather_system(weight, scale, grid, system)
         # With equal weights the equations separate by axis.
-        across, down = (_axis(samples, grid.points, str(tiles.light.device))[3] for samples in (nx, ny))
-        start = _laid_out((down @ tiles.light.unflatten(2, (grid.points, grid.points)) @ across.T).flatten(2))
+        columns = fitted_columns(tiles, ny) if columns is None else columns
+        start = _laid_out((columns @ _axis(nx, grid.points, str(tiles.light.device))[3].T).flatten(2))
         *work, out = (space(3, nx * ny) for _ in range(4))
         ridge = _RIDGE * grid.points**2 / (nx * ny)
         arrays = [interop.to_warp(each) for each in (start, *work, out)]
@@ -221,6 +221,12 @@ def solve(tiles: Tiles, nx: int, ny: int, rounds: int = _FINE) -> torch.Tensor:
         rounds = min(rounds, 2 * nx * ny)
         kernels.solve(light, weight, scale, grid, system, ridge, rounds, arrays[0], arrays[1:4], arrays[4])
     return out.unflatten(2, (ny, nx)).permute(0, 2, 3, 1)
+
+
+def fitted_columns(tiles: Tiles, ny: int) -> torch.Tensor:
+    """Returns the ny samples of least squared error along y at each column of points, float [T, 3, ny, m]."""
+    points = SUPERSAMPLING * tiles.size
+    return _axis(ny, points, str(tiles.light.device))[3] @ tiles.light.unflatten(2, (points, points))
 
 
 def _grid(tiles: Tiles, nx: int, ny: int) -> kernels.Grid:
@@ -288,14 +294,18 @@ def curves(tiles: Tiles, sizes: list[Size], stages: Stages) -> np.ndarray:
     stores them. The checkpoint of `stages` saves the errors at each size as one batch."""
     meter, pieces = Meter(stages.progress, "curves", len(sizes)), [piece for _, piece in _pieces(tiles)]
     table = {"error": Part(np.float64, (len(tiles.index),), least=0.0)}
+    columns: dict[int, list[torch.Tensor]] = {}  # those of one number of rows, which the next sizes share
 
     def at_size(i: int, size: Size) -> dict[str, np.ndarray]:
         if meter.due(i):
             meter.report(i)
         result, rounds = [], _ROUGH if size.step == 1 else _MEDIUM
-        for piece in pieces:
-            samples = solve(piece, size.nx, size.ny, rounds).clamp(min=0.0)
-            weight = sample_weights(piece, size.nx, size.ny)
+        if size.ny not in columns:
+            columns.clear()
+            columns[size.ny] = [fitted_columns(piece, size.ny) for piece in pieces]
+        for piece, own in zip(pieces, columns[size.ny], strict=True):
+            samples = solve(piece, size.nx, size.ny, rounds, own).clamp(min=0.0)
+            weight = sample_weights(piece, size.nx, size.ny) if size.format == BLOCKS else None
             result.append(errors(piece, colour.stored(samples, weight, size.format)))
         return {"error": torch.cat(result).cpu().numpy()}  # one copy, so that the GPU waits for the CPU once
 

@@ -1,4 +1,4 @@
-"""Kits of six-way smoke: a flip book, and a billboard that plays and lights it."""
+"""Kits of six-way smoke: a flip book, and a billboard that plays and lights it; or a network that lights it live."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -19,7 +19,8 @@ from wlm.export.engines.kit import (
     picture_entry,
     write_texts,
 )
-from wlm.export.files import decode_texture
+from wlm.export.files import decode_texture, write_buffer
+from wlm.export.page.html import asset
 from wlm.export.shading import custom_node, translate
 
 _LAYOUT = "unity"
@@ -28,7 +29,14 @@ _NO_MIPS = "The shader reads no mips of the textures; `--mips 3` of the export m
 
 def write_kit(bundle: Bundle, folder: Path, engine: str) -> dict[str, Any]:
     """Writes the kit of a flip book in the layout "unity", with its textures as PNGs, for one of `wlm.export.ENGINES`
-    into an existing folder; returns the entries of the folder's index: shader and textures."""
+    into an existing folder, or of a network for three.js; returns the entries of the folder's index."""
+    if bundle.system == "smoke-network":
+        if engine != "three" or bundle.document["settings"]["guide"] != "six":
+            raise WlmError(f"{bundle.name}: expected the engine three and a network with the guide six, got {engine}")
+        core = "\n".join(map(asset, ("graphics.js", "live.js")))
+        texts = {"live.js": filled("three_live.js", CORE=core), "smoke.js": filled("three_smoke.js")}
+        write_texts(folder, texts | {README_FILE: filled("three_live.md", NAME=bundle.name)})
+        return {"script": "live.js", "buffers": {"weights": write_buffer(folder, "weights", bundle.buffers["weights"])}}
     if bundle.document["layout"] != _LAYOUT:
         raise WlmError(f"layout: expected {_LAYOUT} for {engine}, got {bundle.document['layout']}")
     textures = {}

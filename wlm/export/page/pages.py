@@ -1,7 +1,7 @@
 """`make_page` and `write_page`: the HTML page of any file that a browser can show."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib import import_module
 from inspect import signature
 from pathlib import Path
@@ -18,6 +18,7 @@ _PAGES = {
     "probe": ("wlm.export.page.probe", "probe_page"),
     "settings": ("wlm.export.page.scene", "scene_page"),
     "six-way": ("wlm.export.page.smoke", "smoke_page"),
+    "volume": ("wlm.export.page.smoke", "live_page"),
 }
 """Module and function that make the page of a kind of content."""
 
@@ -44,6 +45,8 @@ def make_page(
     time: float | None = None,
     hours: int = 6,
     rate: float = 30.0,
+    network: str | os.PathLike[str] | None = None,
+    volume: Mapping[str, Any] | None = None,
     up: Literal["y", "z"] = "y",
     progress: OnProgress | None = None,
 ) -> Page:
@@ -51,13 +54,17 @@ def make_page(
 
     Args:
         files: One `.wlm` of lightmaps over time, lightmaps of meshes or probes; six-way lightmaps of smoke, one EXR a
-            frame, or their folder; or the YAML file of a scene, see `wlm.scene.load`.
+            frame, or their folder; volumes of smoke, one file or a folder of frames; or the YAML file of a scene, see
+            `wlm.scene.load`.
         mesh: Mesh file of the scene. To show lightmaps over time, it must have the UVs of the lightmaps.
         original: The input that was compressed, to compare with: a lightmap set, a lightmap, or a probe file.
         key: Name of the array to read from an original probe file with several arrays.
         time: Hour of the day to show of light probes that have several.
         hours: Largest number of original lightmaps in the page, at evenly spread times.
         rate: Playback speed of smoke, in frames per second.
+        network: Network by which the browser makes six-way lightmaps of volumes, a file or "fast", the one that ships
+            with wlm; None: it makes them by a coarse march, as `wlm.smoke.predict` does.
+        volume: Options of `wlm.smoke.load_frames` for volumes, such as {"extinction": 14.0}.
         up: The axis that points up in the scene.
         progress: Called about twice a second while originals or frames of smoke are read.
 
@@ -68,11 +75,12 @@ def make_page(
     if kind == "smoke":
         raise WlmError(f"{paths[0]}: a smoke network has no picture of its own; expected lightmaps predicted by it")
     if kind not in _PAGES:
-        raise WlmError(f"{paths[0]}: expected a .wlm file, a scene or six-way EXRs")
+        raise WlmError(f"{paths[0]}: expected a .wlm file, a scene, smoke or six-way EXRs")
     module, function = _PAGES[kind]
     make = getattr(import_module(module), function)
     known = signature(make).parameters
     given: dict[str, Any] = {"mesh": mesh, "original": original, "key": key, "time": time}
+    given |= {"network": network, "volume": volume}
     given = {name: value for name, value in given.items() if value is not None}
     check_options(Path(files[0]), tuple(given), tuple(known))
     # These have defaults for every kind.

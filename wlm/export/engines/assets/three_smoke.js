@@ -67,18 +67,8 @@ async function readPng(url, THREE, mips) {
   return texture;
 }
 
-export async function loadSmoke(url, THREE) {
-  const base = new URL(url, document.baseURI), beside = (name) => new URL(name, base).href;
-  const info = await (await fetched(base)).json();
-  const shader = await (await fetched(beside(info.shader))).text();
-  const uniforms = THREE.UniformsUtils.clone(THREE.UniformsLib.lights), textures = [];
-  uniforms.wlm_time = {value: 0};
-  uniforms.wlm_size = {value: new THREE.Vector2(...info.frame_size)};
-  await Promise.all(Object.entries(info.textures).map(async ([name, {file}]) => {
-    const texture = await readPng(beside(file), THREE, info.levels > 0);
-    uniforms[`wlm_smoke_${name}_map`] = {value: texture};
-    textures.push(texture);
-  }));
+// Makes the billboard; `shader` defines the functions that read its textures.
+export function makeBillboard(THREE, uniforms, shader, extent) {
   const material = new THREE.ShaderMaterial({
     uniforms,
     vertexShader: VERTEX,
@@ -92,7 +82,22 @@ export async function loadSmoke(url, THREE) {
     blendSrc: THREE.OneFactor,
     blendDst: THREE.OneMinusSrcAlphaFactor,
   });
-  const mesh = new THREE.Mesh(new THREE.PlaneGeometry(...info.extent), material);
+  return new THREE.Mesh(new THREE.PlaneGeometry(...extent), material);
+}
+
+export async function loadSmoke(url, THREE) {
+  const base = new URL(url, document.baseURI), beside = (name) => new URL(name, base).href;
+  const info = await (await fetched(base)).json();
+  const shader = await (await fetched(beside(info.shader))).text();
+  const uniforms = THREE.UniformsUtils.clone(THREE.UniformsLib.lights), textures = [];
+  uniforms.wlm_time = {value: 0};
+  uniforms.wlm_size = {value: new THREE.Vector2(...info.frame_size)};
+  await Promise.all(Object.entries(info.textures).map(async ([name, {file}]) => {
+    const texture = await readPng(beside(file), THREE, info.levels > 0);
+    uniforms[`wlm_smoke_${name}_map`] = {value: texture};
+    textures.push(texture);
+  }));
+  const mesh = makeBillboard(THREE, uniforms, shader, info.extent);
   return {
     info,
     mesh,
@@ -103,7 +108,7 @@ export async function loadSmoke(url, THREE) {
       uniforms.wlm_time.value = loop ? time % info.frames : Math.min(time, info.frames - 1);
     },
     dispose() {
-      for (const each of [...textures, material, mesh.geometry]) each.dispose();
+      for (const each of [...textures, mesh.material, mesh.geometry]) each.dispose();
     },
   };
 }

@@ -13,8 +13,8 @@ const WHOLE = `${HEAD}
 void main() { gl_Position = vec4(vec2(gl_VertexID & 1, gl_VertexID >> 1) * 4.0 - 1.0, 0.0, 1.0); }`;
 
 class Graphics {
-  constructor(canvas) {
-    const gl = canvas.getContext('webgl2', {antialias: true, alpha: false});
+  // `gl` is a context that already exists.
+  constructor(canvas, gl = canvas.getContext('webgl2', {antialias: true, alpha: false})) {
     if (!gl) throw new Error('this browser has no WebGL2');
     this.gl = gl;
     this.canvas = canvas;
@@ -68,6 +68,7 @@ class Graphics {
       else if (type === gl.FLOAT_VEC3) gl.uniform3fv(place, value);
       else if (type === gl.FLOAT_VEC4) gl.uniform4fv(place, value);
       else if (type === gl.INT_VEC2) gl.uniform2iv(place, value);
+      else if (type === gl.INT_VEC3) gl.uniform3iv(place, value);
       else if (type === gl.FLOAT) gl.uniform1f(place, value);
       else gl.uniform1i(place, value);
     }

@@ -30,12 +30,18 @@ async function start(page, signal) {
   document.getElementById('message').hidden = true;
   // For scripts; `first` is when the first picture was drawn, in milliseconds.
   const shown = {kind, page, manifest, graphics, first: undefined};
+  graphics.canvas.addEventListener('webglcontextlost', (event) => {
+    event.preventDefault();
+    fail('the browser took the GPU from this page, which begins again when it is back');
+  }, {signal});
+  graphics.canvas.addEventListener('webglcontextrestored', () => location.reload(), {signal});
   const loop = (time) => {
     if (signal?.aborted) {
       // Browsers keep few contexts.
       graphics.gl.getExtension('WEBGL_lose_context')?.loseContext();
       return;
     }
+    if (graphics.gl.isContextLost()) return;
     const elapsed = time - last;
     last = time;
     try {

@@ -1,4 +1,5 @@
-// The page of six-way lightmaps: a billboard under a light that follows the pointer, in front of a checkerboard.
+// The page of six-way lightmaps: a billboard under a light that follows the pointer, in front of a checkerboard. The
+// lightmaps are stored, or computed from a volume whenever the view or the frame changes (`live.js`).
 
 const BILLBOARD = `${HEAD}
 uniform mat4 u_camera;
@@ -42,18 +43,26 @@ void main()
     colour = vec4(wlm_screen(light), 1.0);
 }`;
 
+const SIZES = ['128', '256', '512'];  // texels along the edge of computed lightmaps
+const FAST = 8;  // milliseconds for lightmaps, below which the page goes on to larger ones
+
 class SmokePage {
   constructor(graphics, page, panel, changed) {
-    const {manifest} = page, {gl} = graphics, {frames, planes} = manifest.smoke;
+    const {manifest} = page, {gl} = graphics, {frames} = manifest.smoke;
     Object.assign(this, {graphics, manifest, plane: 0, light: 1, glow: 1, toward: [0.6, 0.5, 0.62]});
-    const {width, height} = manifest, form = [gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE];
-    const texture = (name) => graphics.plain(width, height, form, page.array(name, Uint8Array), gl.LINEAR);
-    this.frames = Array.from({length: frames}, (_, i) => ({
-      u_first: texture(`first_${i}`), u_second: texture(`second_${i}`), u_most: manifest.smoke.most[i],
-    }));
+    let amounts;
+    if (manifest.live) amounts = this.#begin(page, panel, changed);
+    const {smoke: {planes}, width, height} = manifest;
+    if (!amounts) {
+      const form = [gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE];
+      const texture = (name) => graphics.plain(width, height, form, page.array(name, Uint8Array), gl.LINEAR);
+      this.frames = Array.from({length: frames}, (_, i) => ({
+        u_first: texture(`first_${i}`), u_second: texture(`second_${i}`), u_most: manifest.smoke.most[i],
+      }));
+      const opaque = (i) => page.array(`second_${i}`, Uint8Array).reduce((sum, code, k) => sum + (k % 4 === 2 ? code : 0), 0);
+      amounts = Array.from({length: frames}, (_, i) => opaque(i));
+    }
     // The page opens on the frame with most smoke.
-    const opaque = (i) => page.array(`second_${i}`, Uint8Array).reduce((sum, code, k) => sum + (k % 4 === 2 ? code : 0), 0);
-    const amounts = Array.from({length: frames}, (_, i) => opaque(i));
     this.frame = amounts.indexOf(Math.max(...amounts));
     this.program = graphics.program(BILLBOARD, SHADE);
     if (frames > 1) {
@@ -70,19 +79,28 @@ class SmokePage {
     this.display = new Display(page, panel, changed);
     this.aspect = width / height;
     this.camera = new Camera(graphics.canvas, [0, -1, 0], [this.aspect, 0, 0], {flat: true, changed});
-    // The pointer moves the light; two touches and the wheel still move the picture.
+    // The pointer moves the light or turns the view; two touches and the wheel still move the picture.
     const pan = this.camera;
+    let last;
     graphics.canvas.addEventListener('pointermove', (event) => {
+      const before = last;
+      last = [event.clientX, event.clientY];
       if (!event.buttons || pan.pointers.size > 1 || event.shiftKey) return;
+      if (this.turns && before) {
+        const [dx, dy] = last.map((x, i) => x - before[i]);
+        this.setTurn((this.turn - 0.35 * dx + 540) % 360 - 180);
+        this.setTilt(this.tilt + 0.35 * dy);
+        return;
+      }
       const box = graphics.canvas.getBoundingClientRect(), half = 0.5 * Math.min(box.width, box.height);
       const x = (event.clientX - box.left - box.width / 2) / half, y = (box.top + box.height / 2 - event.clientY) / half;
       // Inside the circle the light is in front of the smoke, outside behind it.
       const far = Math.hypot(x, y), angle = Math.min(far, 2) * Math.PI / 2, scale = far > 1e-6 ? Math.sin(angle) / far : 0;
-      this.toward = unit([x * scale, y * scale, Math.cos(angle)]);
+      this.lightFrom(unit([x * scale, y * scale, Math.cos(angle)]));
       changed();
     });
     pan.still = true;
-    explainCamera(panel, 'turn the light', () => pan.reset());
+    explainCamera(panel, manifest.live ? 'turn the view or the light' : 'turn the light', () => pan.reset());
     const level = (name, set) => panel.slider(name, {
       min: 0, max: 4, step: 0.05, value: 1, text: (value) => `${value.toFixed(2)}×`, changed: (value) => { set(value); changed(); },
     });
@@ -97,10 +115,96 @@ class SmokePage {
   advance(elapsed) {
     if (this.playing === undefined) return;
     // The slider was moved in the meantime.
-    if (Math.floor(this.playing) % this.frames.length !== this.frame) this.playing = this.frame;
+    if (Math.floor(this.playing) % this.manifest.smoke.frames !== this.frame) this.playing = this.frame;
     this.playing += elapsed / 1000 * this.manifest.smoke.rate;
-    const frame = Math.floor(this.playing) % this.frames.length;
+    const frame = Math.floor(this.playing) % this.manifest.smoke.frames;
     if (frame !== this.frame) this.setFrame(frame);
+  }
+
+  // Prepares computed lightmaps: a view that turns, their size, and what makes them. Returns how much smoke a frame has.
+  #begin(page, panel, changed) {
+    const {manifest} = page, {network, frames} = manifest.live, names = ['density', 'heat'];
+    this.arrays = (i) => Object.fromEntries(names.filter((name) => page.has(`${name}_${i}`)).map((name) => [name, page.array(`${name}_${i}`, Uint16Array)]));
+    const boxes = frames.map(({shape}, i) => smokyBox(shape, this.arrays(i).density));
+    // The image shows all smoke of all frames from any side.
+    const some = boxes.some(({count}) => count), ends = frames.flatMap(({voxel, origin, shape}, i) => {
+      const {low, high, count} = boxes[i], corners = count ? [low, high] : some ? [] : [[0, 0, 0], shape];
+      return corners.map((corner) => corner.map((x, axis) => origin[axis] + voxel * x));
+    });
+    const [low, high] = [Math.min, Math.max].map((least) => ends.reduce((a, b) => a.map((x, axis) => least(x, b[axis]))));
+    this.target = low.map((x, axis) => 0.5 * (x + high[axis]));
+    this.extent = Math.hypot(...low.map((x, axis) => high[axis] - x));
+    Object.assign(manifest, {exposure: 1, width: 1, height: 1});
+    manifest.smoke.planes = [...PLANE_NAMES.slice(0, 7), ...frames.some(({heat}) => heat) ? ['emission'] : []];
+    this.lamp = this.toward;  // towards the light, in the world
+    Object.assign(this, {turns: true, turn: 30, tilt: 10, size: Number(SIZES[0]), grows: true, made: network ? 'blend' : 'march'});
+    this.live = new LiveSmoke(this.graphics, network, page.array('weights', Uint16Array));
+    const angle = (name, most) => panel.slider(name, {
+      min: -most, max: most, step: 1, value: this[name], text: (value) => `${value}°`, changed: (value) => { this[name] = value; this.stale = true; changed(); },
+    });
+    [this.setTurn, this.setTilt] = [angle('turn', 180), angle('tilt', 89)];
+    panel.choices('drag', ['view', 'light'], 'view', (name) => { this.turns = name === 'view'; });
+    this.choose = panel.choices('texels', SIZES, SIZES[0], (name) => { this.resize(Number(name)); changed(); });
+    if (network) {
+      panel.choices('made by', ['blend', 'network', 'march'], 'blend', (name) => { Object.assign(this, {made: name, stale: true}); changed(); });
+    }
+    this.panel = panel;
+    this.stale = true;
+    return boxes.map(({count}) => count);
+  }
+
+  resize(size) { Object.assign(this, {size, grows: false, stale: true}); }
+
+  // Sets the direction to the light, given in the camera's axes.
+  lightFrom(toward) {
+    this.toward = toward;
+    if (!this.live) return;
+    const {right, up, toward: ahead} = this.view();
+    this.lamp = right.map((x, i) => x * toward[0] + up[i] * toward[1] + ahead[i] * toward[2]);
+  }
+
+  // The camera of computed lightmaps.
+  view() {
+    const [turn, tilt] = [this.turn, this.tilt].map((degrees) => degrees * Math.PI / 180), {target, extent} = this;
+    const toward = [Math.sin(turn) * Math.cos(tilt), Math.sin(tilt), Math.cos(turn) * Math.cos(tilt)];
+    const right = [Math.cos(turn), 0, -Math.sin(turn)];
+    return {right, up: cross(toward, right), toward, target, extent, width: this.size, height: this.size};
+  }
+
+  // Computes the lightmaps of the frame, seen by the camera.
+  #compute() {
+    if (this.shown !== this.frame) {
+      if (this.smoke) this.live.discard(this.smoke);
+      this.smoke = this.live.volume(this.manifest.live.frames[this.frame], this.arrays(this.frame));
+      this.shown = this.frame;
+    }
+    const view = this.view(), begin = performance.now();
+    const {first, second, shares} = this.live.render(this.smoke, view, this.made);
+    // Reading waits until the lightmaps are drawn.
+    this.graphics.read(second, 1, 1);
+    const time = performance.now() - begin;
+    this.toward = [view.right, view.up, view.toward].map((axis) => dot(axis, this.lamp));
+    this.frames = {[this.frame]: {u_first: first, u_second: second, u_most: [1, 1, 1]}};
+    this.panel.figure('lightmaps', `${this.size} × ${this.size} texels`);
+    this.panel.figure('time for them', `${time.toFixed(1)} ms`);
+    if (shares) this.panel.figure('weight of the network', `${(100 * this.graphics.read(shares)[0]).toFixed(0)}%`);
+    this.stale = false;
+    // The first time has the compilation of the shaders in it.
+    if (this.grows && this.timed && time < FAST && this.size < Number(SIZES.at(-1))) {
+      this.choose(String(2 * this.size));
+      this.grows = true;
+    }
+    this.timed = true;
+  }
+
+  // The lightmaps of a frame, as [2 x height x width x 4] numbers: right, left, top, bottom; front, back, opacity, emission.
+  read(frame = this.frame) {
+    if (this.live && (this.stale || frame !== this.frame)) {
+      this.frame = frame;
+      this.#compute();
+    }
+    const {u_first, u_second} = this.frames[frame], values = [u_first, u_second].map((map) => this.graphics.read(map));
+    return Float32Array.from([...values[0], ...values[1]], (x) => x * x);
   }
 
   #uniforms(width) {
@@ -111,7 +215,9 @@ class SmokePage {
   }
 
   draw() {
-    const {graphics} = this, {width} = graphics.begin();
+    const {graphics} = this;
+    if (this.live && (this.stale || this.shown !== this.frame)) this.#compute();
+    const {width} = graphics.begin();
     graphics.use(this.program, {...this.#uniforms(width), u_camera: this.camera.matrix()});
     graphics.gl.drawArrays(graphics.gl.TRIANGLE_STRIP, 0, 4);
   }
