@@ -1,7 +1,7 @@
 """Simulation, lighting and drawing of a scene frame by frame, in memory.
 
 On CUDA the lighting of a frame, from the march to the picture, is one CUDA graph. If a network makes the lightmaps,
-only the network has a graph.
+only the network has a graph, and smoke in bricks has none.
 """
 
 import time
