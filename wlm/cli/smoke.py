@@ -268,11 +268,11 @@ def light(
             )
             drawing = Drawing(view, lamps, **extra)
             drawing.move(0.0 if looks is None else looks.time)
-            solid = drawing.solid(volume)
+            volume = drawing.among(volume)
             if orders == "single":
-                made: LitSmoke | ScatteredSmoke = light_smoke(volume, view, lamps, march, solid=solid)
+                made: LitSmoke | ScatteredSmoke = light_smoke(volume, view, lamps, march)
             else:
-                made = scatter(volume, view, lamps, colour, march=march, solid=solid)
+                made = scatter(volume, view, lamps, colour, march=march)
             image = drawing(made)
             path = file(frame)
             if path.suffix.lower() == ".exr":
@@ -312,7 +312,7 @@ def run(
     """Simulate a scene, light it and draw it frame by frame, without intermediate files.
 
     The lights and the fire of the scene illuminate the smoke with all orders of scattering. A table shows the median
-    time of each stage; on a GPU, after some frames, one CUDA graph does all lighting stages.
+    time of each stage.
     """
     check_white(white)
     if orders == "all" and network is not None:

@@ -513,20 +513,18 @@ class Solver:
         emission: float = 1.0,
         cell: float = 1.0,
         origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
-        dense: bool = True,
     ) -> DensityVolume:
         """Returns the smoke as a volume. Without bricks it shares the solver's memory and is valid until the next step;
-        with bricks it is a copy, of all cells or, if not `dense`, of the bricks with smoke.
+        with bricks it is a copy of those that have smoke.
 
         Args:
             extinction: Extinction per length of the world at density 1.
             emission: Light emitted per length of the world at temperature 1.
             cell: Edge of a cell of the lattice in the world's unit.
             origin: Corner of the domain in the world.
-            dense: Whether all cells are in the volume; marches take others, too, but files do not.
         """
         where: dict[str, Any] = {"voxel": cell * self._box.voxel, "origin": origin}
-        if self._pool is None or dense:
+        if self._pool is None:
             values = [wp.to_torch(part) for part in (self.density, self.temperature) if part is not None]
         else:
             numbers, values = self.bricks()

@@ -31,6 +31,7 @@ from wlm.formats.reading import FileBytes, open_file, read_file
 from wlm.formats.vdb import LARGEST, GridHead, VdbFile
 from wlm.formats.vdb_writing import encode_vdb
 from wlm.interop import check_device, to_warp
+from wlm_kernels.smoke.march import Solid
 
 EDGE = 8
 """Voxels along an edge of a brick."""
@@ -89,6 +90,7 @@ class DensityVolume:
         places: int32 tensor [X / 8, Y / 8, Z / 8], rounded up, numbers of bricks of 8^3 voxels: density and temperature
             are then [N, 8, 8, 8], with 0 in brick 0. None: all voxels are stored.
         cells: X, Y and Z of a volume with `places`.
+        solid: Obstacles for marches that light the smoke, see `wlm.view.smoke.Drawing.among`.
     """
 
     density: torch.Tensor
@@ -101,6 +103,7 @@ class DensityVolume:
     warnings: tuple[str, ...] = ()
     places: torch.Tensor | None = None
     cells: tuple[int, int, int] | None = None
+    solid: "Solid | None" = None
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -347,9 +350,8 @@ def save_volume(
     suffix = _suffix(path)
     if volume.kelvin:
         raise WlmError(f"{path}: temperature: expected kelvins, found their light: load the volume with kelvin=False")
-    fields = {_DENSITY: volume.density}
-    if volume.temperature is not None:
-        fields[_TEMPERATURE] = volume.temperature
+    parts = zip((_DENSITY, _TEMPERATURE), (volume.density, volume.temperature), strict=True)
+    fields = {name: torch.cat(list(volume.slabs(part))) for name, part in parts if part is not None}
     if suffix != ".npz":
         grids = {name: values.cpu().numpy() for name, values in fields.items()}
         grids |= {} if velocity is None else {"velocity": velocity}

@@ -4,7 +4,7 @@ import math
 import time
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import torch
@@ -192,15 +192,13 @@ def _covers(body: Body, edge: float, places: np.ndarray, time: float) -> np.ndar
     return reach[body.shape] < 1.0
 
 
-def volume_of(scene: Scene, solver: fluid.Solver, *, kelvin: bool = False, dense: bool = True) -> DensityVolume:
-    """Returns the solver's smoke, in the solver's memory if there are no bricks, and valid until the next step; `dense`
-    as for `Solver.frame`.
+def volume_of(scene: Scene, solver: fluid.Solver, *, kelvin: bool = False) -> DensityVolume:
+    """Returns the solver's smoke, in the solver's memory if there are no bricks, and valid until the next step.
 
     The temperature of fire becomes the light of black bodies or, with `kelvin`, kelvins.
     """
     smoke, grid = scene.smoke, scene.grid
-    where: dict[str, Any] = {"cell": grid.cell, "origin": grid.origin, "dense": dense}
-    volume = solver.frame(extinction=smoke.extinction, emission=smoke.emission, **where)
+    volume = solver.frame(extinction=smoke.extinction, emission=smoke.emission, cell=grid.cell, origin=grid.origin)
     if smoke.fire is None:
         return volume
     hot = smoke.fire.kelvin(volume.temperature)

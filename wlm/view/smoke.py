@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -26,8 +27,8 @@ class Drawing:
     """Draws pictures of smoke from one camera, under fixed lights, into buffers that are allocated once.
 
     With lightmaps, at a pixel an obstacle is in front of all of the smoke or behind all of it, depending on the depth
-    of the smoke's surface, and shadows this surface. Smoke that a march lights with the obstacles `solid` is shadowed
-    in its depth, also from point lights, and ends at them. Point lights do not light obstacles.
+    of the smoke's surface, and shadows this surface. Smoke that a march lights `among` the obstacles is shadowed in
+    its depth, also from point lights, and ends at them. Point lights do not light obstacles.
 
     `move` sets the positions of the obstacles. A call then only launches kernels, so on CUDA a graph can capture it.
 
@@ -114,15 +115,15 @@ class Drawing:
             out = to_warp(self.solid_light, wp.vec3), to_warp(self.solid_depth)
             kernels.light_solids(self._solids, self._as_lamps(), _AMBIENT, self._camera.in_world(), *out)
 
-    def solid(self, volume: DensityVolume) -> "Solid | None":
-        """Draws the obstacles, and returns them for marches through a volume, which follow `move`; None without any."""
+    def among(self, volume: DensityVolume) -> DensityVolume:
+        """Draws the obstacles, and returns the volume with them for marches that light it; they follow `move`."""
         if not self._obstacles:
-            return None
+            return volume
         self.draw_obstacles()
         solid = Solid()
         solid.mesh, solid.voxel, solid.stop = self._solids.mesh.id, volume.voxel, to_warp(self.solid_depth)
         solid.corner = wp.vec3(*(np.asarray(volume.origin) - self._camera.position))
-        return solid
+        return replace(volume, solid=solid)
 
     def draw_shadows(self, surface: torch.Tensor) -> None:
         """Writes to `visibility` which lights reach the smoke's surface at distances [H, W]; 0: no surface, lit."""
@@ -135,7 +136,7 @@ class Drawing:
         """Draws a frame, and returns `image`.
 
         `smoke`, on the device, are lightmaps with transparency and, if there are obstacles, with depth; or smoke that
-        was lit by the drawing's lights, with its obstacles (`solid`). `ScatteredSmoke` already includes the albedo.
+        was lit by the drawing's lights, among its obstacles. `ScatteredSmoke` already includes the albedo.
         """
         six = smoke if isinstance(smoke, SixWay) else None
         seen = smoke.lit if isinstance(smoke, ScatteredSmoke) else smoke
@@ -143,12 +144,12 @@ class Drawing:
             raise ValueError("lights: expected only directional lights for six-way lightmaps, got a point light")
         if seen.transparency is None:
             raise ValueError("smoke: expected lightmaps or lit smoke with transparency, found none")
-        if self._obstacles and (seen.depth if six is not None else seen.solid) is None:
-            raise ValueError("smoke: expected lightmaps with a depth, or smoke lit with obstacles, found neither")
+        if self._obstacles and seen.depth is None:
+            raise ValueError("smoke: expected a depth, which obstacles need, found none")
         with stream(self._device):
             solids = None
             if self._obstacles:
-                surface = torch.zeros_like(self.solid_depth)
+                surface = self.solid_depth  # lit smoke ends there, so that no obstacle is before it
                 if six is not None:
                     self.draw_obstacles()
                     self.draw_shadows(seen.depth)
@@ -200,6 +201,8 @@ def picture(
         raise ValueError("smoke: expected lightmaps or lit smoke with a camera, found none")
     options = {"albedo": albedo, "background": background, "ramp": ramp, "obstacles": obstacles, "rule": rule}
     device = device_name(lit.transparency.device if lit.transparency is not None else lit.lightmaps.device)
+    if obstacles and not isinstance(smoke, SixWay):
+        raise ValueError("obstacles: expected none with lit smoke, which a Drawing draws among obstacles")
     drawing = Drawing(lit.camera, lit.lights if lights is None else lights, **options, device=device)
     drawing.move(time)
     return drawing(smoke)

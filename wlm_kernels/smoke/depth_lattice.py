@@ -10,7 +10,6 @@ no two of its rays are parallel.
 Units and sampling are those of `march`.
 """
 
-import functools
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -37,7 +36,7 @@ voxels."""
 _MOST_MARCHING = 2**24  # largest number of nodes of a point light, each of which marches separately
 _AT_ONCE = wp.constant(8)  # nodes of a line that a thread sums at a time
 _LEAST_SPACING = 0.25  # voxels between nodes
-_DEEPEST = wp.constant(60000.0)  # largest optical depth, within the range of half floats
+_DEEPEST = wp.constant(60000.0)  # largest optical depth between nodes, within the range of half floats
 _NEVER = wp.constant(1.0e30)
 _DARK = wp.constant(6.0)  # optical depth of an obstacle: a larger one would widen shadows between nodes
 _ROUNDING = 1e-6  # relative excess of a part over the step that is tolerated, so that rounding adds no part
@@ -68,18 +67,8 @@ def axis(lattice: Lattice, n: int) -> wp.vec3:
     return wp.vec3(lattice.axes[n, 0], lattice.axes[n, 1], lattice.axes[n, 2])
 
 
-@wp.func_native("return wp::half(a).u | (unsigned int)(wp::half(b).u) << 16u;")
-def _halves(a: float, b: float) -> int: ...
-
-
 @wp.func
-def packed(ahead: float, behind: float) -> int:
-    """Returns two optical depths as half floats in a word, which `march.halves` reads."""
-    return _halves(wp.min(ahead, _DEEPEST), wp.min(behind, _DEEPEST))
-
-
-@wp.func
-def depths_at(nodes: wp.array3d[int], lattice: Lattice, p: wp.vec3) -> wp.vec2:
+def depths_at(nodes: wp.array3d[wp.vec2], lattice: Lattice, p: wp.vec3) -> wp.vec2:
     """Interpolates optical depths to the light and to the opposite light trilinearly between nodes."""
     inverse = wp.vec3(1.0 / lattice.gap[0], 1.0 / lattice.gap[1], 1.0 / lattice.gap[2])
     return between_nodes(nodes, wp.cw_mul(lattice.axes * (p - lattice.origin) - lattice.low, inverse))
@@ -107,53 +96,49 @@ def _on_line(pair: int, line: int, n: int, k: int) -> wp.vec4i:
     return wp.vec4i(pair, wp.where(pair == 0, n, line), wp.where(pair == 0, line, n), k)
 
 
-@functools.cache
-def _add_up(obstacles: bool) -> wp.Kernel:
-    @wp.kernel(module="unique", module_options=OPTIONS)
-    def kernel(
-        # in:
-        gaps: wp.array4d[wp.float16],
-        lattice: Lattice,
-        solid: Solid,
-        # out:
-        nodes: wp.array4d[int],
-    ):
-        """Sums optical depths from each node of a line to both of its ends; the light is beyond the last node."""
-        pair, line, k = wp.tid()
-        last = wp.where(pair == 0, nodes.shape[1], nodes.shape[2]) - 1
-        if line >= wp.where(pair == 0, nodes.shape[2], nodes.shape[1]):
-            return
-        # Nodes farther from the last node, and from the first one, are in the shadow of obstacles.
-        lit = float(_NEVER)
-        opposite = float(_NEVER)
-        if wp.static(obstacles):
-            gap = wp.where(pair == 0, lattice.gap[0], lattice.gap[1])
-            lit = _lit_way(solid, _on_line(pair, line, last, k), lattice, axis(lattice, pair)) / gap
-            opposite = _lit_way(solid, _on_line(pair, line, 0, k), lattice, -axis(lattice, pair)) / gap
-        # In double precision, since the depth ahead is a difference. Several nodes at a time, since loads wait for
-        # earlier stores.
-        ahead = wp.float64(0.0)
-        for n in range(last):
-            q = _on_line(pair, line, n, k)
-            ahead += wp.float64(gaps[q[0], q[1], q[2], q[3]])
-        behind = wp.float64(0.0)
-        for begin in range(0, last + 1, _AT_ONCE):
-            several = _Several()
-            for m in range(_AT_ONCE):
-                if begin + m < last:
-                    q = _on_line(pair, line, begin + m, k)
-                    several[m] = float(gaps[q[0], q[1], q[2], q[3]])
-            for m in range(_AT_ONCE):
-                n = begin + m
-                if n <= last:
-                    q = _on_line(pair, line, n, k)
-                    a = float(ahead) + wp.where(float(last - n) > lit, _DARK, 0.0)
-                    b = float(behind) + wp.where(float(n) > opposite, _DARK, 0.0)
-                    nodes[q[0], q[1], q[2], q[3]] = packed(a, b)
-                    ahead -= wp.float64(several[m])
-                    behind += wp.float64(several[m])
-
-    return kernel
+@wp.kernel(module="unique", module_options=OPTIONS)
+def _add_up(
+    # in:
+    gaps: wp.array4d[wp.float16],
+    lattice: Lattice,
+    solid: Solid,
+    # out:
+    nodes: wp.array4d[wp.vec2],
+):
+    """Sums optical depths from each node of a line to both of its ends; the light is beyond the last node."""
+    pair, line, k = wp.tid()
+    last = wp.where(pair == 0, nodes.shape[1], nodes.shape[2]) - 1
+    if line >= wp.where(pair == 0, nodes.shape[2], nodes.shape[1]):
+        return
+    # Nodes farther from the last node, and from the first one, are in the shadow of obstacles.
+    lit = float(_NEVER)
+    opposite = float(_NEVER)
+    if solid.mesh != wp.uint64(0):
+        gap = wp.where(pair == 0, lattice.gap[0], lattice.gap[1])
+        lit = _lit_way(solid, _on_line(pair, line, last, k), lattice, axis(lattice, pair)) / gap
+        opposite = _lit_way(solid, _on_line(pair, line, 0, k), lattice, -axis(lattice, pair)) / gap
+    # In double precision, since the depth ahead is a difference. Several nodes at a time, since loads wait for earlier
+    # stores.
+    ahead = wp.float64(0.0)
+    for n in range(last):
+        q = _on_line(pair, line, n, k)
+        ahead += wp.float64(gaps[q[0], q[1], q[2], q[3]])
+    behind = wp.float64(0.0)
+    for begin in range(0, last + 1, _AT_ONCE):
+        several = _Several()
+        for m in range(_AT_ONCE):
+            if begin + m < last:
+                q = _on_line(pair, line, begin + m, k)
+                several[m] = float(gaps[q[0], q[1], q[2], q[3]])
+        for m in range(_AT_ONCE):
+            n = begin + m
+            if n <= last:
+                q = _on_line(pair, line, n, k)
+                a = float(ahead) + wp.where(float(last - n) > lit, _DARK, 0.0)
+                b = float(behind) + wp.where(float(n) > opposite, _DARK, 0.0)
+                nodes[q[0], q[1], q[2], q[3]] = wp.vec2(a, b)
+                ahead -= wp.float64(several[m])
+                behind += wp.float64(several[m])
 
 
 @for_smoke
@@ -196,7 +181,7 @@ def _reach(smoke_type: Any) -> wp.Kernel:
         lattice: Lattice,
         step: float,
         # out:
-        nodes: wp.array3d[int],
+        nodes: wp.array3d[wp.vec2],
     ):
         i, j, k = wp.tid()
         p = _node(lattice, i, j, k)
@@ -217,7 +202,7 @@ def _reach(smoke_type: Any) -> wp.Kernel:
             skipped = wp.max(lattice.gap)
             if skipped + way_to_solid(smoke.solid, p + skipped * toward, toward) < away:
                 tau += _DARK
-        nodes[i, j, k] = packed(tau, 0.0)
+        nodes[i, j, k] = wp.vec2(tau, 0.0)
 
     return kernel
 
@@ -255,45 +240,37 @@ def make_lattice(
     return lattice, tuple(n + 1 for n in gaps)
 
 
-def add_up(medium: Medium, lattice: Lattice, counts: Sequence[int], pairs: int, light_step: float) -> wp.array:
+def add_up(medium: Medium, lattice: Lattice, counts: Sequence[int], pairs: int, step: float) -> wp.array:
     """Computes the optical depths from the nodes of a lattice of `make_lattice` to one or two `pairs` of opposite
     lights at infinity: at both ends of the lattice's first axis, and of its second.
 
-    `light_step` is the longest step between two nodes, in voxels. Returns int [pairs, X, Y, Z] for each node: `packed`
-    depths to the light at the axis's end and to the light at its start.
+    `step` is the longest step between two nodes, in voxels. Returns vec2 [pairs, X, Y, Z] for each node: depths
+    to the light at the axis's end and to the light at its start.
     """
-    parts = wp.vec2i(*(parts_of(lattice.gap[n], light_step) for n in range(2)))
-    gaps, nodes = (medium.buffer((pairs, *counts), dtype) for dtype in (wp.float16, int))
+    parts = wp.vec2i(*(parts_of(lattice.gap[n], step) for n in range(2)))
+    gaps, nodes = (medium.buffer((pairs, *counts), dtype) for dtype in (wp.float16, wp.vec2))
     _measure(medium, tuple(counts), [lattice, parts], [gaps], pairs)
     lines = max(counts[:2]) if pairs == 2 else counts[1]
-    kernel, inputs = _add_up(medium.solid is not None), [gaps, lattice, medium.solid or Solid()]
-    wp.launch(kernel, (pairs, lines, counts[2]), inputs, [nodes], device=medium.device)
+    inputs = [gaps, lattice, medium.solid or Solid()]
+    wp.launch(_add_up, (pairs, lines, counts[2]), inputs, [nodes], device=medium.device)
     return nodes
-
-
-def spacing_of(march: March) -> tuple[float, float]:
-    """Returns the largest distance between nodes of the lattice, and the longest step between them, in voxels."""
-    spacing = march.step if march.spacing is None else march.spacing
-    return spacing, spacing if march.light_step is None else march.light_step
 
 
 def reach(medium: Medium, place: Sequence[float], radius: float | None, march: March) -> tuple[Lattice, wp.array]:
     """Computes optical depths from the smoke to a light at `place`: the direction to a light at infinity, of length 1,
     or the position of a point light in voxels with a radius in voxels, within which its irradiance is constant.
 
-    Of `march` only spacing and light_step are used; the lattice of a point light has at most 2^24 nodes. Returns a
-    lattice, and int [X, Y, Z] at its nodes, which `depths_at` reads: depths to the light and to the opposite light, for
-    a point light 0.
+    Of `march` only the spacing is used, or the step; the lattice of a point light has at most 2^24 nodes. Returns a
+    lattice, and vec2 [X, Y, Z] at its nodes: depths to the light and to the opposite light, for a point light 0.
     """
-    spacing, step = spacing_of(march)
-    shape = medium.shape
+    spacing, shape = march.spacing or march.step, medium.shape
     if radius is None:
         lattice, counts = make_lattice(shape, _axes(place), spacing)
-        return lattice, add_up(medium, lattice, counts, 1, step).reshape(counts)
+        return lattice, add_up(medium, lattice, counts, 1, spacing).reshape(counts)
     lattice, counts = make_lattice(shape, ((1, 0, 0), (0, 1, 0), (0, 0, 1)), spacing, most=_MOST_MARCHING)
     lattice.place, lattice.point, lattice.radius = wp.vec3(*place), 1, float(radius)
-    nodes = medium.buffer(counts, int)
-    _reach(medium, counts, [lattice, step], [nodes])
+    nodes = medium.buffer(counts, wp.vec2)
+    _reach(medium, counts, [lattice, spacing], [nodes])
     return lattice, nodes
 
 

@@ -353,35 +353,6 @@ def sample(smoke: Any, p: wp.vec3) -> float:
     return 0.0
 
 
-@wp.func_native("""
-    wp::half a, b;
-    a.u = bits & 0xffffu;
-    b.u = bits >> 16u;
-    return wp::vec2(wp::half_to_float(a), wp::half_to_float(b));
-""")
-def halves(bits: int) -> wp.vec2: ...
-
-
-@wp.func
-def _value(node: int) -> wp.vec2:
-    return halves(node)
-
-
-@wp.func
-def _value(node: float) -> float:
-    return node
-
-
-@wp.func
-def _value(node: wp.vec3) -> wp.vec3:
-    return node
-
-
-@wp.func
-def _on_row(nodes: wp.array3d[Any], i: int, j: int, k: int, k1: int, f: float):
-    return wp.lerp(_value(nodes[i, j, k]), _value(nodes[i, j, k1]), f)
-
-
 @wp.func
 def between_nodes(nodes: wp.array3d[Any], q: wp.vec3):
     """Interpolates an array trilinearly at the index q, which may have fractions; q is clamped to the array."""
@@ -396,8 +367,8 @@ def between_nodes(nodes: wp.array3d[Any], q: wp.vec3):
     k1 = wp.min(k + 1, nodes.shape[2] - 1)
     fy = y - float(j)
     fz = z - float(k)
-    near = wp.lerp(_on_row(nodes, i, j, k, k1, fz), _on_row(nodes, i, j1, k, k1, fz), fy)
-    far = wp.lerp(_on_row(nodes, i1, j, k, k1, fz), _on_row(nodes, i1, j1, k, k1, fz), fy)
+    near = wp.lerp(wp.lerp(nodes[i, j, k], nodes[i, j, k1], fz), wp.lerp(nodes[i, j1, k], nodes[i, j1, k1], fz), fy)
+    far = wp.lerp(wp.lerp(nodes[i1, j, k], nodes[i1, j, k1], fz), wp.lerp(nodes[i1, j1, k], nodes[i1, j1, k1], fz), fy)
     return wp.lerp(near, far, x - float(i))
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import warp as wp
 
-from wlm_kernels.smoke.depth_lattice import Lattice, add_up, axis, depths_at, make_lattice, reach, spacing_of
+from wlm_kernels.smoke.depth_lattice import Lattice, add_up, axis, depths_at, make_lattice, reach
 from wlm_kernels.smoke.march import (
     BRICK,
     OPTIONS,
@@ -25,7 +25,6 @@ from wlm_kernels.smoke.march import (
     box_of,
     emitted,
     for_smoke,
-    halves,
     in_tiles,
     look,
     optical_depth,
@@ -61,7 +60,7 @@ def _guide(smoke_type: Any, from_lattice: bool) -> wp.Kernel:
     def kernel(
         # in:
         smoke: smoke_type,
-        nodes: wp.array3d[int],
+        nodes: wp.array3d[wp.vec2],
         view: View,
         lattice: Lattice,
         march: MarchParameters,
@@ -111,28 +110,26 @@ def guide(medium: Medium, view: View, march: March, out: wp.array, *, shared: bo
     Args:
         medium: The smoke, of albedo 1.
         view: The camera, [H, W] pixels.
-        march: Settings; its step is also the step towards the lights. Its cutoff causes an error of at most the cutoff
-            in transparency, and 2.5 times the cutoff in light (for g = 0).
+        march: Settings; its step, at least a voxel, is also the step towards the lights. Its cutoff causes an error of
+            at most the cutoff in transparency, and 2.5 times the cutoff in light (for g = 0).
         out: float [3, H, W], written: sum of the light scattered under the three lights, each of irradiance 4 pi;
             transparency; distance from the camera, in the unit of `View.voxel`, to the first sample denser than the
             threshold, 0 if there is none.
         shared: Whether the optical depths to the top and the bottom are interpolated between the nodes of a lattice,
             at least a voxel apart; otherwise each sample marches to the lights itself, which is slower and more exact.
     """
-    lattice, nodes = Lattice(), medium.buffer((0, 0, 0), int)
+    lattice, nodes = Lattice(), medium.buffer((0, 0, 0), wp.vec2)
     if shared:
-        lattice, nodes = reach(
-            medium, view.up, None, replace(march, spacing=max(march.step, 1.0), light_step=march.step)
-        )
+        lattice, nodes = reach(medium, view.up, None, replace(march, spacing=max(march.step, 1.0)))
     _guide(medium, in_tiles(*out.shape[1:]), [nodes, view, lattice, parameters(march)], [out], shared)
 
 
 @wp.func
-def _in_plane(nodes: wp.array4d[int], i: int, j: int, k: int, fx: float, fy: float) -> wp.vec4:
+def _in_plane(nodes: wp.array4d[wp.vec2], i: int, j: int, k: int, fx: float, fy: float) -> wp.vec4:
     sides = wp.vec4()
     for pair in range(2):
-        a = wp.lerp(halves(nodes[pair, i, j, k]), halves(nodes[pair, i, j + 1, k]), fy)
-        b = wp.lerp(halves(nodes[pair, i + 1, j, k]), halves(nodes[pair, i + 1, j + 1, k]), fy)
+        a = wp.lerp(nodes[pair, i, j, k], nodes[pair, i, j + 1, k], fy)
+        b = wp.lerp(nodes[pair, i + 1, j, k], nodes[pair, i + 1, j + 1, k], fy)
         c = wp.lerp(a, b, fx)
         sides[2 * pair] = c[0]
         sides[2 * pair + 1] = c[1]
@@ -145,7 +142,7 @@ def _coarse(smoke_type: Any, hot: bool) -> wp.Kernel:
     def kernel(
         # in:
         smoke: smoke_type,
-        nodes: wp.array4d[int],
+        nodes: wp.array4d[wp.vec2],
         view: View,
         lattice: Lattice,
         march: MarchParameters,
@@ -167,7 +164,7 @@ def _coarse(smoke_type: Any, hot: bool) -> wp.Kernel:
         j = wp.clamp(int(y), 0, nodes.shape[2] - 2)
         fx = wp.clamp(x - float(i), 0.0, 1.0)
         fy = wp.clamp(y - float(j), 0.0, 1.0)
-        loaded = int(-2)  # the plane of nodes whose depths are in `near`
+        loaded = int(-1)  # the plane of nodes whose depths are in `near`
         near = wp.vec4()
         far = wp.vec4()
         while r.done < r.count:
@@ -179,9 +176,7 @@ def _coarse(smoke_type: Any, hot: bool) -> wp.Kernel:
                 z = (r.distance - lattice.low[2]) / lattice.gap[2]
                 k = wp.clamp(int(z), 0, nodes.shape[3] - 2)
                 if k != loaded:
-                    near = far
-                    if k != loaded + 1:
-                        near = _in_plane(nodes, i, j, k, fx, fy)
+                    near = _in_plane(nodes, i, j, k, fx, fy)
                     far = _in_plane(nodes, i, j, k + 1, fx, fy)
                     loaded = k
                 tau = wp.lerp(near, far, wp.clamp(z - float(k), 0.0, 1.0))
@@ -222,9 +217,9 @@ def coarse_six_way(medium: Medium, view: View, march: March, out: wp.array) -> N
     require_orthographic(view, "six-way lightmaps")
     if march.step < BRICK:
         medium = medium.in_bricks()
-    spacing, light_step = spacing_of(march)
+    spacing = march.spacing or march.step
     lattice, counts = make_lattice(medium.shape, (view.right, view.up, view.forward), spacing, view.origin)
-    nodes = add_up(medium, lattice, counts, 2, light_step)
+    nodes = add_up(medium, lattice, counts, 2, spacing)
     hot = medium.temperature is not None
     _coarse(medium, in_tiles(*out.shape[1:]), [nodes, view, lattice, parameters(march)], [out], hot)
 
@@ -235,7 +230,7 @@ def _light(smoke_type: Any) -> wp.Kernel:
     def kernel(
         # in:
         smoke: smoke_type,
-        nodes: wp.array3d[int],
+        nodes: wp.array3d[wp.vec2],
         view: View,
         lattice: Lattice,
         march: MarchParameters,

@@ -7,7 +7,7 @@ towards a light has only the error of its step. `wlm.smoke.transport.orders` add
 import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -19,7 +19,7 @@ from wlm.smoke.camera import Camera
 from wlm.smoke.march.launch import medium_of
 from wlm.smoke.shading import AnyLight, Light, Ramp, checked_albedo, glow_of, in_voxels
 from wlm_kernels.smoke import depth_lattice, marches
-from wlm_kernels.smoke.march import Medium, Solid, View
+from wlm_kernels.smoke.march import Medium, View
 from wlm_kernels.smoke.settings import March
 
 _CLOSE, _FINEST = 0.1, 0.25  # optical depth per step, and least step in voxels
@@ -41,7 +41,6 @@ class LitSmoke:
         march: Settings of the march that computed them.
         thrown: float32 tensor [H, W, 3], light that the smoke emits and scatters to the camera, not yet multiplied by
             the colour of the emission; None: the smoke is cold, or this light was not computed.
-        solid: Obstacles that shadow the smoke and at which rays end; None: there are none.
     """
 
     lights: tuple[AnyLight, ...]
@@ -53,7 +52,6 @@ class LitSmoke:
     camera: Camera
     march: March
     thrown: torch.Tensor | None = None
-    solid: "Solid | None" = None
 
     def shade(
         self,
@@ -122,18 +120,16 @@ def light_smoke(
     march: March | None = None,
     *,
     shadow: float = 1.0,
-    solid: "Solid | None" = None,
 ) -> LitSmoke:
     """Computes light that was scattered once, by a separate march for each light.
 
     Args:
-        volume: The smoke.
+        volume: The smoke; its `solid` shadows it, and camera rays end there.
         camera: Any camera, outside the smoke or inside.
         lights: Any number of lights.
         march: Settings of the marches; None: those of `fine_march`.
         shadow: Factor of the extinction on the ways to the lights; 1 is physical, a smaller value approximates an
             octave of multiple scattering.
-        solid: Obstacles, of `wlm.view.smoke.Drawing.solid`: they shadow the smoke, and rays end at them.
 
     Returns:
         The light on the smoke's device.
@@ -142,7 +138,7 @@ def light_smoke(
         ValueError: A light has a direction of length 0, or a negative or infinite colour.
     """
     march = fine_march(volume) if march is None else march
-    with marching(volume, camera, march, shadow, solid) as scene:
+    with marching(volume, camera, march, shadow) as scene:
         return light_in(scene, volume, camera, lights)
 
 
@@ -176,13 +172,10 @@ class Marching:
 
 
 @contextmanager
-def marching(
-    volume: DensityVolume, camera: Camera, march: March, shadow: float = 1.0, solid: "Solid | None" = None
-) -> Iterator[Marching]:
+def marching(volume: DensityVolume, camera: Camera, march: March, shadow: float = 1.0) -> Iterator[Marching]:
     """Prepares a march on the smoke's device; arguments as for `light_smoke`."""
     with stream(device_name(volume.device)):
-        medium = replace(medium_of(volume).in_bricks(), solid=solid)
-        yield Marching(medium, camera.view(volume), march, shadow)
+        yield Marching(medium_of(volume).in_bricks(), camera.view(volume), march, shadow)
 
 
 def light_in(
@@ -204,5 +197,4 @@ def light_in(
             visit(n, depths)
     transparency, emission, depth = scene.unlit()
     hot = emission if volume.temperature is not None else None
-    images = (*planes, transparency, hot, depth)
-    return LitSmoke(tuple(lights), *images, camera, scene.march, solid=scene.medium.solid)
+    return LitSmoke(tuple(lights), *planes, transparency, hot, depth, camera, scene.march)

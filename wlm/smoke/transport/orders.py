@@ -27,7 +27,6 @@ from wlm.smoke.shading import AnyLight, Light, PointLight, Ramp, checked_albedo
 from wlm.smoke.transport.diffusion import Spreading, share_of, thrown_by_fire
 from wlm.smoke.transport.lighting import LitSmoke, light_in, light_smoke, marching
 from wlm_kernels.smoke import orders
-from wlm_kernels.smoke.march import Solid
 from wlm_kernels.smoke.orders import FEATURES, MIXES, THINNEST
 from wlm_kernels.smoke.settings import March
 
@@ -89,17 +88,12 @@ def orders_march(volume: DensityVolume, g: float = 0.0) -> March:
 
 
 def make_inputs(
-    volume: DensityVolume,
-    camera: Camera,
-    lights: Sequence[AnyLight],
-    albedos: Sequence[float],
-    march: March,
-    solid: "Solid | None" = None,
+    volume: DensityVolume, camera: Camera, lights: Sequence[AnyLight], albedos: Sequence[float], march: March
 ) -> tuple[LitSmoke, Inputs]:
     """Computes light scattered once, whose images it returns, and light by diffusion, and thus the inputs of the
     prediction; `march` has g = 0. To be called inside `wlm.interop.stream`."""
     ways = [aim(light, volume) for light in lights]
-    with marching(volume, camera, march, solid=solid) as scene:
+    with marching(volume, camera, march) as scene:
         spreading = Spreading(scene, volume, lights)
         lit = light_in(scene, volume, camera, lights, spreading.add)
         diffused, thin = spreading.render(albedos)
@@ -248,9 +242,10 @@ def scatter(
     *,
     march: March | None = None,
     model: OrdersModel | None = None,
-    solid: "Solid | None" = None,
 ) -> ScatteredSmoke:
     """Predicts light of all orders of scattering from marches and diffusion.
+
+    Light that was scattered once passes through the obstacles of the volume.
 
     Args:
         volume: The smoke.
@@ -262,7 +257,6 @@ def scatter(
             multiple scattering is that of isotropic smoke whose extinction is reduced by the share g^2 of light that is
             not deflected (delta-Eddington: Joseph, Wiscombe and Weinman 1976); the error grows with |g|.
         model: The weights; None: those that ship with wlm.
-        solid: Obstacles as for `light_smoke`; light that was scattered once passes through them.
 
     Raises:
         ValueError: The albedo is not three numbers from 0 to 1.
@@ -281,7 +275,7 @@ def scatter(
             thinner = (colour * (1.0 - straight) / left).clip(0.0, 1.0)
             even = replace(march, g=0.0)
         values = sorted(set(map(float, thinner)))
-        lit, inputs = make_inputs(alike, camera, lights, values, even, solid)
+        lit, inputs = make_inputs(alike, camera, lights, values, even)
         planes = model.light(inputs, thinner)
         for n, light in enumerate(lights):
             if (near := share_of(light, alike)) > 0.0:
@@ -290,13 +284,13 @@ def scatter(
             if (factor := aim(light, alike)[1]) != 1.0:
                 planes[n] /= factor
         if march.g != 0.0:
-            once = light_smoke(volume, camera, lights, march, solid=solid)
+            once = light_smoke(volume, camera, lights, march)
             for channel in range(3):
                 planes[..., channel] += colour[channel] * once.planes - thinner[channel] * lit.planes
             planes.clamp_(min=0.0)
             lit = once
         if volume.temperature is not None:
-            with marching(alike, camera, even, solid=solid) as scene:
+            with marching(alike, camera, even) as scene:
                 thrown = thrown_by_fire(scene, alike, values)
             lit = replace(lit, thrown=torch.stack([thrown[values.index(float(value))] for value in thinner], -1))
     return ScatteredSmoke(lit, planes)
