@@ -52,13 +52,20 @@ _REGISTERS = "launch__registers_per_thread"
 _BUSY = 0.6  # a unit that is busier than this decides the time
 
 
-def run(*, device: str, only: Sequence[str] | None = None, progress: Note | None = None) -> list[Row]:
+def run(
+    *,
+    device: str,
+    only: Sequence[str] | None = None,
+    progress: Note | None = None,
+    done: Callable[[Sequence[Row]], None] | None = None,
+) -> list[Row]:
     """Profiles the cases; see the module.
 
     Args:
         device: "cuda:0".
         only: Names of cases; None: all.
         progress: Called with a line before each case.
+        done: Called with all rows so far after each case.
 
     Raises:
         WlmError: A case does not exist, the device is a CPU, or `ncu` is missing.
@@ -77,6 +84,8 @@ def run(*, device: str, only: Sequence[str] | None = None, progress: Note | None
             rows += summarise(bench.row, name, _profiled(ncu, name, device))
         except WlmError as error:
             rows.append(bench.missing_row(name, "", error))
+        if done is not None:
+            done(rows)
     return rows
 
 

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.ndimage import map_coordinates
 
 
 @dataclass
@@ -35,17 +36,7 @@ class Scene:
 def trilinear(grid: np.ndarray, p: np.ndarray) -> np.ndarray:
     """The grid at points [..., 3], voxel centres at i + 1/2, zero outside."""
     grid = np.pad(np.asarray(grid, np.float64), 1)
-    q = p + 0.5
-    low = np.floor(q).astype(int)
-    f = q - low
-    out = np.zeros(p.shape[:-1])
-    for corner in np.ndindex(2, 2, 2):
-        i = low + np.array(corner)
-        inside = ((i >= 0) & (i < grid.shape)).all(-1)
-        i = np.clip(i, 0, np.array(grid.shape) - 1)
-        w = np.prod(np.where(np.array(corner) == 1, f, 1 - f), -1)
-        out += np.where(inside, w * grid[i[..., 0], i[..., 1], i[..., 2]], 0.0)
-    return out
+    return map_coordinates(grid, p.reshape(-1, 3).T + 0.5, order=1, mode="constant").reshape(p.shape[:-1])
 
 
 def span(shape: tuple, o: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -117,43 +108,41 @@ def lit(scene: Scene, toward: np.ndarray, step: float, g: float) -> np.ndarray:
 def six_way(
     scene: Scene, step: float, g: float, temperature: np.ndarray | None = None, emission: float = 0.0
 ) -> np.ndarray:
-    """Right, left, top, bottom, front, back, transparency, emission, [8, H, W], with the kernels' own samples.
-
-    The planes' depths are those of the box; the lights to the sides are marched to from each sample in whole parts of a
-    pixel.
-    """
+    """Right, left, top, bottom, front, back, transparency, emission, [8, H, W], in equal steps up to `step`."""
     corners = np.array(list(np.ndindex(2, 2, 2))) * (np.array(scene.density.shape) + 1.0) - 0.5
     depths = (corners - scene.origin) @ -scene.toward
-    near, far = depths.min(), depths.max()
     o, d = scene.rays()
 
-    def planes(first: float, last: float) -> tuple[np.ndarray, float]:
+    def steps(first: float, last: float) -> tuple[np.ndarray, float]:
         count = max(int(np.ceil((last - first) / step)), 0)
         dz = (last - first) / max(count, 1)
         return first + (np.arange(count) + 0.5) * dz, dz
 
-    def column(first: float, last: float) -> np.ndarray:
-        at, dz = planes(first, last)
-        return sum((trilinear(scene.density, o + s * d) * dz * scene.extinction for s in at), np.zeros(o.shape[:2]))
-
-    behind, ahead = column(near, min(far, 0.0)), column(max(near, 0.0), far)
-    ds = scene.pitch / max(1, np.ceil(scene.pitch / step))
-    reach = int(np.ceil(np.linalg.norm(scene.density.shape) * 1.5 / ds)) + 1
-    at, dz = planes(max(near, 0.0), far)
+    at, dz = steps(depths.min(), min(depths.max(), 0.0))
+    behind = sum((trilinear(scene.density, o + s * d) for s in at), np.zeros(o.shape[:2])) * dz * scene.extinction
+    parts = int(np.ceil(scene.pitch / step))
+    ds = scene.pitch / parts
+    # A line reaches this many steps beyond its pixels, out of the smoke.
+    beyond = int((max(o.shape) * scene.pitch + np.linalg.norm(corners[-1] - corners[0])) / ds) + 1
+    at, dz = steps(max(depths.min(), 0.0), depths.max())
     out = np.zeros((8, *o.shape[:2]))
     tau = np.zeros(o.shape[:2])
     for s in at:
         p = o + s * d
         x = trilinear(scene.density, p) * dz * scene.extinction
-        share = np.exp(-tau) * (1 - np.exp(-x))
-        for c, way in enumerate((scene.right, -scene.right, scene.up, -scene.up)):
-            side = sum(trilinear(scene.density, p + (n + 0.5) * ds * way) for n in range(reach)) * ds * scene.extinction
-            out[c] += phase(g, 0.0) * share * np.exp(-side)
-        out[4] += phase(g, -1.0) * np.exp(-behind - 2 * tau) * (1 - np.exp(-2 * x)) / 2
-        out[5] += phase(g, 1.0) * np.exp(-ahead) * x
+        share = np.exp(-tau) * -np.expm1(-x)
+        for axis, way, ahead, back in ((1, scene.right, 0, 1), (0, -scene.up, 3, 2)):
+            long = (o.shape[axis] - 1) * parts
+            line = p.take(0, axis)[:, None] + (np.arange(-beyond, long + beyond) + 0.5)[:, None] * ds * way
+            sums = np.cumsum(np.pad(trilinear(scene.density, line), ((0, 0), (1, 0))), 1) * ds * scene.extinction
+            passed = sums[:, beyond : beyond + long + 1 : parts]
+            for plane, side in ((ahead, sums[:, -1:] - passed), (back, passed)):
+                out[plane] += phase(g, 0.0) * share * np.exp(-(side if axis else side.T))
         if temperature is not None:
             hot = emission * trilinear(temperature, p) * dz
             out[7] += hot * np.exp(-tau) * np.where(x > 0, (1 - np.exp(-x)) / np.where(x > 0, x, 1.0), 1.0)
         tau += x
+    out[4] = phase(g, -1.0) * np.exp(-behind) * -np.expm1(-2 * tau) / 2
+    out[5] = phase(g, 1.0) * tau * np.exp(-tau)
     out[6] = np.exp(-tau)
     return out

@@ -20,7 +20,7 @@ def web(
             metavar="[FILE...]",
             help="A .wlm of lightmaps, meshes or probes; six-way lightmaps (.exr, one per frame, or a folder); smoke "
             "(.npz, .nvdb or .vdb, or a folder of frames), lit in the browser; or a scene (.yaml). Without a file, the "
-            "page is a viewer that opens such files in the browser, but for scenes and smoke.",
+            "page is a viewer that opens models and six-way lightmaps in the browser.",
         ),
     ] = None,
     mesh: SceneFile = None,

@@ -41,10 +41,12 @@ def bake(
     Args:
         volume: The smoke.
         camera: Orthographic. Smoke behind its plane or outside the image is not visible but casts shadows.
-        step: Longest step, in voxels, along rays and to the lights. Samples lie in the middles of the steps.
+        step: Longest step, in voxels, along rays and to the lights. Steps are shorter where the smoke is dense and
+            its density changes: a step of 0.5 gives a PSNR of 60 dB and more at extinctions up to 100 per voxel.
         g: Mean cosine of the Henyey-Greenstein phase function, between -1 and 1.
         supersample: Number n of rays along a pixel's edge, whose n x n results are averaged; 1: only the centre.
         estimate: Whether to estimate the error by a second march with twice the step, which adds half of the work.
+            Transparencies below 1e-7 are not resolved.
 
     Returns:
         The lightmaps on the smoke's device.

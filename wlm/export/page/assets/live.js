@@ -174,14 +174,24 @@ void main()
     four = made;
 }`;
 
+// Weights are half floats, four for each number n, two times four in a texel.
+const WEIGHT = `
+uniform usampler2D u_weights;
+mat2x4 wlm_pair(int n)
+{
+    uvec4 bits = texelFetch(u_weights, ivec2(n >> 1 & 511, n >> 10), 0);
+    return mat2x4(unpackHalf2x16(bits.x), unpackHalf2x16(bits.y), unpackHalf2x16(bits.z), unpackHalf2x16(bits.w));
+}
+vec4 wlm_weight(int n) { return wlm_pair(n)[n & 1]; }`;
+
 // A convolution of u_groups groups of four channels. The weights of each group of the result, group of the input and tap
 // are four texels, one for each channel of the input.
 const CONVOLUTION = `
-uniform sampler2D u_weights, u_image, u_skip, u_rest, u_scale;
+uniform sampler2D u_image, u_skip, u_rest, u_scale;
 uniform ivec2 u_size;
 uniform int u_groups, u_above, u_begin, u_bias, u_norm, u_beta, u_at;
 out vec4 four;
-vec4 wlm_weight(int n) { return texelFetch(u_weights, ivec2(n & 1023, n >> 10), 0); }
+${WEIGHT}
 vec4 wlm_fetch(sampler2D image, ivec2 p, int group) { return texelFetch(image, ivec2(p.x, p.y + group * u_size.y), 0); }
 float wlm_mean, wlm_inverse;
 
@@ -223,7 +233,8 @@ void main()
             for (int x = -EDGE / 2; x <= EDGE / 2; ++x, n += 4) {
                 ivec2 p = q + ivec2(x, y);
                 if (any(lessThan(p, ivec2(0))) || any(greaterThanEqual(p, u_size))) continue;
-                four += mat4(wlm_weight(n), wlm_weight(n + 1), wlm_weight(n + 2), wlm_weight(n + 3)) * wlm_input(p, i);
+                vec4 x4 = wlm_input(p, i);
+                four += wlm_pair(n) * x4.xy + wlm_pair(n + 2) * x4.zw;
             }
 #ifdef RELU
     four = max(four, vec4(0.0));
@@ -235,11 +246,11 @@ void main()
 
 // The product of the two halves of the channels, each after a 3 x 3 convolution of single channels.
 const GATE = `${HEAD}
-uniform sampler2D u_weights, u_image;
+uniform sampler2D u_image;
 uniform ivec2 u_size;
 uniform int u_groups, u_begin, u_bias;
 out vec4 four;
-vec4 wlm_weight(int n) { return texelFetch(u_weights, ivec2(n & 1023, n >> 10), 0); }
+${WEIGHT}
 vec4 wlm_half(ivec2 q, int group)
 {
     vec4 sum = wlm_weight(u_bias + group);
@@ -379,11 +390,18 @@ function smokyBox(shape, density) {
   let count = 0;
   for (let i = 0, n = 0; i < shape[0]; ++i) {
     for (let j = 0; j < shape[1]; ++j) {
+      let first = -1, last = -1;
       for (let k = 0; k < shape[2]; ++k, ++n) {
         if (!density[n]) continue;
         count += 1;
-        [i, j, k].forEach((at, axis) => { low[axis] = Math.min(low[axis], at); high[axis] = Math.max(high[axis], at + 1); });
+        if (first < 0) first = k;
+        last = k;
       }
+      if (first < 0) continue;
+      [[i, i], [j, j], [first, last]].forEach(([from, to], axis) => {
+        low[axis] = Math.min(low[axis], from);
+        high[axis] = Math.max(high[axis], to + 1);
+      });
     }
   }
   return {low, high, count};
@@ -523,6 +541,7 @@ class LiveSmoke {
     for (const [name, [rows, columns = 1, height = 1, width = 1]] of Object.entries(shapes)) {
       const first = offset;
       offset += rows * columns * height * width;
+      if (texels.length % 8) texels.push(0, 0, 0, 0);
       this.places[name] = texels.length / 4;
       const push = (count, texel) => { for (let n = 0; n < 4 * count; ++n) texels.push(texel(n)); };
       const taps = height * width, groups = Math.ceil(columns / 4), whole = Math.ceil(rows / 4);
@@ -539,7 +558,8 @@ class LiveSmoke {
     }
     const {gl} = this.graphics, values = new Uint16Array(4096 * Math.ceil(texels.length / 4096));
     values.set(texels);
-    this.weights = this.graphics.plain(1024, values.length / 4096, this.graphics.half(), values, gl.NEAREST);
+    const form = [gl.RGBA32UI, gl.RGBA_INTEGER, gl.UNSIGNED_INT];
+    this.weights = this.graphics.plain(512, values.length / 4096, form, new Uint32Array(values.buffer), gl.NEAREST);
   }
 
   // Runs the network on a guide; returns its encoded planes, in two textures.
