@@ -257,7 +257,8 @@ def _gather(smoke_type: Any) -> wp.Kernel:
                     )
                     light += t * absorbed(x) * phase(march.g, 0.0) * left
                 if smoke.emission > 0.0:
-                    hot += smoke.emission * density_at(smoke.temperature, smoke, p) * plane[1] * t * mean_transparency(x)
+                    glow = smoke.emission * density_at(smoke.temperature, smoke, p)
+                    hot += glow * plane[1] * t * mean_transparency(x)
                 tau += x
         passed[row, col] = tau
         for c in range(4):
