@@ -12,8 +12,7 @@ SAIL = "v -1 0 -1\nv 1 0 -1\nv 0 .5 1\nv 2 1 2\nf 1 2 3\nf 2 3 4\n"
 
 
 def random_scene(seed: int, folder: Path) -> dict:
-    """Draws a small scene in which every setting may be extreme, in the form of its YAML file; its meshes lie in
-    `folder`."""
+    """Draws a small scene in which every setting may be extreme, as its YAML file in a folder, where its mesh is."""
     (folder / "sail.obj").write_text(SAIL)
     random = np.random.default_rng([39, seed])
     pick, chance = random.choice, lambda share: bool(random.random() < share)
@@ -32,7 +31,10 @@ def random_scene(seed: int, folder: Path) -> dict:
         faces |= {"-x": "periodic", "+x": "periodic"}
     inlets = []
     bounded = [face for face in FACES if faces[face] != "periodic"]
-    for face in random.permutation(bounded)[: random.integers(0, 3)]:
+    opened, *others = random.permutation(bounded)
+    if chance(0.8):
+        faces[str(opened)] = "open"
+    for face in others[: random.integers(0, 3)]:
         axis, high = divmod(FACES.index(face), 2)
         velocity = 0.3 * random.normal(size=3)
         velocity[axis] = -1.0 if high else 1.0
@@ -54,10 +56,8 @@ def random_scene(seed: int, folder: Path) -> dict:
             moved *= cell * 10 ** random.uniform(-1, 1) / np.linalg.norm(moved)
             taken = np.linalg.norm(moved) / (speed * 10 ** random.uniform(-1, 1))
             path.append([path[-1][0] + taken, *(np.array(path[-1][1:]) + moved)])
-        turn = [[random.uniform(-1, 1) / rate, *random.uniform(-400, 400, 3)]] if chance(0.4) else []
-        if chance(0.5) and turn:
-            span = np.radians(700) * radius.max() / (speed * 10 ** random.uniform(-1, 1))
-            turn.append([turn[0][0] + span, *random.uniform(-400, 400, 3)])
+        span = np.radians(700) * radius.max() / (speed * 10 ** random.uniform(-1, 1))
+        turn = [[k * span, *random.uniform(-400, 400, 3)] for k in range(pick([0, 1, 2]))]
         keys = {"path": path, "turn": turn, "offset": [radius.min() * chance(0.2), 0, 0]}
         return out | {name: np.array(rows).astype(float).tolist() for name, rows in keys.items()}
 
@@ -69,13 +69,10 @@ def random_scene(seed: int, folder: Path) -> dict:
         start = random.uniform(-0.2, 1.2) * frames / rate
         stop = None if chance(0.5) else start + 10 ** random.uniform(-4, 0.5) / rate
         what = {"density": float(pick([0.0, 1.0, 100.0])), "temperature": float(pick([0.0, 1.0, 10.0]))}
-        where = {"centre": place(0.3).tolist(), "radius": cell * 10 ** random.uniform(-2, 0.7)}
-        if chance(0.5):
-            where = body()
         if chance(0.3):
             noise = {"amount": 10 ** random.uniform(-1, 2), "size": cell * 10 ** random.uniform(-1, 1)}
             what["noise"] = noise | {"duration": 1.0 / rate}
-        sources.append(where | what | {"start": start, "stop": stop})
+        sources.append(body() | what | {"start": start, "stop": stop})
     obstacles = [body() for _ in range(random.integers(0, 4))]
     pull = speed * speed / float(size.max())  # a speed over the box
     smoke = {"buoyancy": pull * 10 ** random.uniform(-2, 2) if chance(0.6) else 0.0}
@@ -96,13 +93,13 @@ def random_scene(seed: int, folder: Path) -> dict:
         keys = [[float(number) for number in key] for key in keys]
         air["wind"] = {"keys": keys, "gusts": float(random.uniform()), "period": frames / rate}
     if chance(0.3):
-        air["confinement"] = rate * 10 ** random.uniform(-1, 2)
+        air["confinement"] = rate * 10 ** random.uniform(-1, 1)
     if chance(0.3):
         air["turbulence"] = {"strength": pull * 10 ** random.uniform(-2, 2), "size": cell * 10 ** random.uniform(0, 1)}
     if chance(0.4):
-        parts = {name: float(10 ** random.uniform(-2, 1)) for name in ("heat", "smoke", "radiation", "expansion")}
-        smoke["fire"] = parts | {"rate": rate * 10 ** random.uniform(-2, 1), "ignition": float(pick([0.0, 0.5]))}
-        smoke["fire"]["radiation"] *= rate
+        heat, smokes, cools, burns = 10 ** random.uniform(-2, 1, 4) * (1, 1, rate, 0.1 * rate)
+        smoke["fire"] = {"rate": burns, "heat": heat, "smoke": smokes, "radiation": cools, "expansion": 0.3}
+        smoke["fire"]["ignition"] = float(pick([0.0, 0.5]))
         for each in (*inlets, *sources):
             each["fuel"] = float(pick([0.0, 1.0, 10.0]))
     grid = {"cells": cells.tolist(), "cell": cell, "refine": int(random.integers(1, 4)), "origin": origin.tolist()}

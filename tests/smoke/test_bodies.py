@@ -162,32 +162,23 @@ def test_a_thin_shell_stops_air(tmp_path, thin):
 
 
 def test_a_resumed_scene_knows_its_mesh(tmp_path):
-    """The content of the file counts, not its name."""
-    body = {"shape": _file(tmp_path), "scale": 0.1, "path": [[0, 0.3, 0.3, 0.3]]}
-    scene = _scene(tmp_path, [body])
-    frames = open_frames(tmp_path / "a", scene)
-    (tmp_path / "frames").mkdir()
-    frames.file(1).write_bytes(b"")
-    moved = _scene(tmp_path, [body | {"shape": _file(tmp_path, "copy.glb")}])
-    open_frames(tmp_path / "a", copy.deepcopy(moved), resume=True)
-    other = _scene(tmp_path, [body | {"shape": _file(tmp_path, "other.glb", _part(slice(9, None)))}])
-    with pytest.raises(WlmError, match="cannot resume: its frames have another obstacles"):
-        open_frames(tmp_path / "a", other, resume=True)
-
-
-def test_a_folder_with_meshes_can_be_moved(tmp_path):
-    """Frames and lightmaps name meshes relative to their folder, and shipped ones by the name that a scene gives."""
-    home = tmp_path / "old"
-    home.mkdir()
+    """The content of the file counts, not its name; frames and lightmaps name meshes relative to their folder, and
+    shipped ones by the name that a scene gives."""
+    (home := tmp_path / "old").mkdir()
+    body = {"shape": _file(home), "scale": 0.1, "path": [[0, 0.3, 0.3, 0.3]]}
     rabbit = {"shape": "meshes/rabbit.ply", "centre": [0, 0, 0]}
-    scene = _scene(home, [{"shape": _file(home), "centre": [0, 0, 0]}, rabbit])
-    open_frames(home / "frames", scene).file(1).write_bytes(b"")
+    scene = _scene(home, [body, rabbit])
+    open_frames(home / "a", scene).file(1).write_bytes(b"")
+    copied = _scene(home, [body | {"shape": _file(home, "copy.glb")}, rabbit])
+    open_frames(home / "a", copy.deepcopy(copied), resume=True)
+    other = _scene(home, [body | {"shape": _file(home, "other.glb", _part(slice(9, None)))}, rabbit])
+    with pytest.raises(WlmError, match="cannot resume: its frames have another obstacles"):
+        open_frames(home / "a", other, resume=True)
     six = bake(plume(), make_camera(CameraSettings(resolution=4), scene.grid.origin, scene.grid.size))
-    write_six_way(home / "six.exr", six, scene.looks(1))
+    write_six_way(home / "six.exr", six, copied.looks(1))
     home = home.rename(tmp_path / "new")
-    shapes = [str(home / "ball.glb"), load_scene("rabbit").obstacles[0].shape]
-    for moved in (load_frames(home / "frames").scene, read_shaded(home / "six.exr")[1]):
-        assert [each.shape for each in moved.obstacles] == shapes
+    for moved in (load_frames(home / "a").scene, read_shaded(home / "six.exr")[1]):
+        assert [each.shape for each in moved.obstacles] == [str(home / "copy.glb"), scene.obstacles[1].shape]
 
 
 def test_a_body_turns_as_its_rows_say():

@@ -313,8 +313,12 @@ class Body(_Settings):
     @property
     def fastest(self) -> float:
         """Largest speed along the path, of a body that turns on its surface, in metres per second."""
+        return self.fastest_in(0.0)
+
+    def fastest_in(self, edge: float) -> float:
+        """Returns `fastest` of the body as it is simulated in cells of an edge in metres."""
         speeds, spins = (np.linalg.norm(rates, axis=1) for rates in self._keyed.rates)
-        reach = float(np.linalg.norm(self.mesh()[0], axis=1).max()) if spins.any() else 0.0
+        reach = float(np.linalg.norm(self.mesh(edge)[0], axis=1).max()) if spins.any() else 0.0
         return float((speeds + reach * spins).max())
 
     @property
@@ -326,12 +330,23 @@ class Body(_Settings):
         """
         return None if self.shape in _SIZES else read_surface(self.shape)
 
-    def mesh(self) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the surface relative to the origin: corners, float64 [V, 3], and triangles, int64 [F, 3]."""
+    def half_extents(self, edge: float) -> np.ndarray:
+        """Returns those, (3,) in metres, of a sphere, box or cylinder as it is simulated in cells of an edge: enough to
+        cover the centre of a cell wherever it is, so that a thin obstacle stops the air."""
+        round_axes = {"sphere": (3, 3, 3), "cylinder": (2, 1, 2), "box": (1, 1, 1)}[self.shape]
+        if self.turn:
+            round_axes = (3, 3, 3)
+        # The sides of a cylinder are segments, slightly inside the circle.
+        least = 0.5 * edge * np.sqrt(round_axes) * np.where(np.array(round_axes) == 1, 1.0 + 1e-4, 1.01)
+        return np.maximum(np.broadcast_to(np.asarray(self.radius, np.float64), 3), least)
+
+    def mesh(self, edge: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the surface relative to the origin, of a shape as thick as it is simulated in cells of an edge:
+        corners, float64 [V, 3], and triangles, int64 [F, 3]."""
         if (read := self.surface) is not None:
             return read.points * self.scale + self.offset, read.triangles
         points, triangles = surface(self.shape)
-        return points * np.asarray(self.radius) + self.offset, triangles
+        return points * self.half_extents(edge) + self.offset, triangles
 
     @functools.cached_property
     def solid(self) -> Mesh:
@@ -607,7 +622,7 @@ class Scene(_Settings):
         inlets = [float(np.linalg.norm(inlet.velocity)) for inlet in self.inlets]
         if self.air.wind is not None:
             inlets.append(self.air.wind.fastest)
-        return [*inlets, *(obstacle.fastest for obstacle in self.obstacles)]
+        return [*inlets, *(obstacle.fastest_in(self.grid.cell) for obstacle in self.obstacles)]
 
     @property
     def _growth(self) -> float:

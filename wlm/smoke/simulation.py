@@ -78,13 +78,11 @@ def warnings_of(scene: Scene) -> list[str]:
     box = f"it is outside the box from ({') to ('.join(corners)})"
     for i, inlet in enumerate(scene.inlets):
         points = _opening(scene, inlet)
-        later = [_opening(scene, other) for other in scene.inlets[i + 1 :] if other.face == inlet.face]
-        if not any(set(map(tuple, points)) <= set(map(tuple, other)) for other in later):
-            later = []
-        if later or all(_is_hidden(scene, points, time) for time in _looks(scene, 0.0, end)):
-            warnings.append(
-                f"inlets.{i}: {'a later inlet' if later else 'an obstacle'} covers it, so that it is closed"
-            )
+        cells, others = set(map(tuple, points)), scene.inlets[i + 1 :]
+        over = {each.face == inlet.face for each in others if cells <= set(map(tuple, _opening(scene, each)))}
+        if over or all(_is_hidden(scene, points, time) for time in _looks(scene, 0.0, end)):
+            effect = "its smoke is replaced" if over == {False} else "it is closed"
+            warnings.append(f"inlets.{i}: {'a later inlet' if over else 'an obstacle'} covers it, so that {effect}")
     for i, body in enumerate(scene.sources):
         duration = scene.step * scene.smoke.substeps
         spans = [(max(start, 0.0), end if stop is None else min(stop, end)) for start, stop in body.spans]
@@ -186,7 +184,7 @@ def _covers(body: Body, edge: float, places: np.ndarray, time: float) -> np.ndar
     away = (places - body.eased.at(time)) @ body.eased.turn(time)
     if body.surface is not None:
         return contains(body.solid.on("cpu"), away, _shell(body, edge))
-    away = np.abs(away - body.offset) / _radius(body, edge)
+    away = np.abs(away - body.offset) / body.half_extents(edge)
     across, along = np.hypot(away[:, 0], away[:, 2]), away[:, 1]
     reach = {"sphere": np.hypot(across, along), "cylinder": np.maximum(across, along), "box": away.max(1)}
     return reach[body.shape] < 1.0
@@ -230,7 +228,7 @@ def simulate(
         volumes: Format in which each frame is written, too, with the velocity of the air in metres per second:
             `frame_0001.vdb`, or `frame_0001.nvdb`, compressed or as a GPU holds it (nvdb-raw). None: no second file.
         checkpoint_every: Seconds between two saves of the state; 0: after every step.
-        progress: Called after each frame, with the figures `smoke`, the integral of the density over the box, and
+        progress: Called after each frame, with the figures `smoke m³`, the integral of the density over the box, and
             `frame s`, the seconds of the frame; and about twice a second within a frame, without figures.
 
     Returns:
@@ -286,7 +284,7 @@ def simulate(
                 try:
                     if last and progress is not None:
                         mass = float(values[0].sum(dtype=torch.float64)) * scene.grid.voxel**3
-                        meter.report(frame, smoke=mass, frame_s=time.perf_counter() - begin)
+                        meter.report(frame, **{"smoke_m³": mass, "frame_s": time.perf_counter() - begin})
                     elif meter.due(frame - 1):
                         meter.report(frame - 1)
                 except KeyboardInterrupt:
@@ -429,7 +427,8 @@ def sources_at(scene: Scene, time: float | None = None) -> list[fluid.Source]:
             shape, centre, size = "box", half.copy(), half.copy()
         else:
             shape, centre = "sphere", (np.asarray(inlet.centre) - grid.origin) / grid.cell
-            size = np.full(3, inlet.radius / grid.cell)
+            # An ellipsoid that has the inlet's radius at the first voxels' centres, so that each open cell gets smoke.
+            size = np.full(3, inlet.radius / grid.cell / math.sqrt(1.0 - (0.5 / grid.refine / _INLET_DEPTH) ** 2))
         centre[axis] = grid.cells[axis] * high
         size[axis] = _INLET_DEPTH
         add(shape, centre, size, inlet)
@@ -444,7 +443,7 @@ def sources_at(scene: Scene, time: float | None = None) -> list[fluid.Source]:
             phase = now / noise.duration % _NOISE_PERIOD
             how["noise"] = fluid.Noise(noise.amount, max(noise.size, grid.voxel) / grid.cell, phase, noise.seed)
         if body.surface is None:
-            shape, size, centre = body.shape, _radius(body, grid.voxel), centre + turn @ body.offset
+            shape, size, centre = body.shape, body.half_extents(grid.voxel), centre + turn @ body.offset
         else:
             shape, size = body.solid, np.ones(3)
         add(shape, (centre - grid.origin) / grid.cell, size / grid.cell, body, **how)
@@ -455,24 +454,21 @@ def _obstacles(scene: Scene) -> list[Obstacle]:
     obstacles: list[Obstacle] = []
     grid = scene.grid
     for body in scene.obstacles:
-        eased, radius = body.eased, _radius(body, grid.cell)
+        eased = body.eased
         path = Trajectory.of((eased.positions - grid.origin) / grid.cell, eased.times / scene.step, eased.rotations)
         if body.shape == "sphere" and not any(body.offset):
-            obstacles.append(Sphere(path, float(radius[0]) / grid.cell))
+            obstacles.append(Sphere(path, float(body.half_extents(grid.cell)[0]) / grid.cell))
             continue
-        thick = body if body.surface else body.model_copy(update={"radius": tuple(radius)})
-        points, triangles = (
-            array.astype(kind) for array, kind in zip(thick.mesh(), (np.float32, np.int32), strict=True)
-        )
-        shell = _shell(body, grid.cell) / grid.cell
-        obstacles.append(Mesh(path, points, triangles, scale=1.0 / grid.cell, shell=shell))
+        points, triangles = body.mesh(grid.cell)
+        how = {"scale": 1.0 / grid.cell, "shell": _shell(body, grid.cell) / grid.cell}
+        obstacles.append(Mesh(path, points.astype(np.float32), triangles.astype(np.int32), **how))
     return obstacles
 
 
 def _is_thin(body: Body, edge: float) -> bool:
     """Tests whether a body is simulated thicker than it is in cells of an edge in metres."""
     if (surface := body.surface) is None:
-        return bool((_radius(body, edge) > body.radius).any())
+        return bool((body.half_extents(edge) > body.radius).any())
     return surface.thickness * body.scale < edge
 
 
@@ -486,23 +482,10 @@ def _shell(body: Body, edge: float) -> float:
 
 def _bounds(body: Body, edge: float) -> np.ndarray:
     """Returns the bounds of a body as it is simulated in cells of an edge, [2, 3] in metres around its origin."""
-    more = _shell(body, edge) if body.surface else _radius(body, edge) - body.radius
+    more = _shell(body, edge) if body.surface else body.half_extents(edge) - body.radius
     return body.bounds + np.multiply.outer((-1.0, 1.0), np.broadcast_to(more, 3))
 
 
 def _share(source: SourceSettings, edge: float) -> float:
     """Returns the share of its density at which a source that is smaller than a voxel emits as much smoke."""
-    return 1.0 if source.surface else float(np.prod(np.broadcast_to(source.radius, 3) / _radius(source, edge)))
-
-
-def _radius(body: Body, edge: float) -> np.ndarray:
-    """Returns the half extents [3] with which a sphere, box or cylinder is simulated: at least such that it covers the
-    centre of a cell of an edge wherever it is, so that a thin obstacle stops the air."""
-    if body.surface is not None:
-        return np.ones(3)
-    round_axes = {"sphere": (3, 3, 3), "cylinder": (2, 1, 2), "box": (1, 1, 1)}[body.shape]
-    if body.turn:
-        round_axes = (3, 3, 3)
-    # The sides of a cylinder are segments, slightly inside the circle.
-    least = 0.5 * edge * np.sqrt(round_axes) * np.where(np.array(round_axes) == 1, 1.0 + 1e-4, 1.01)
-    return np.maximum(np.broadcast_to(np.asarray(body.radius, np.float64), 3), least)
+    return 1.0 if source.surface else float(np.prod(np.broadcast_to(source.radius, 3) / source.half_extents(edge)))
