@@ -115,7 +115,7 @@ def simulate(
         "steps per frame": round(1.0 / (scene.rate * solver.duration)),
     }
     if figures:
-        facts |= {"smoke at the end, m³ of density 1": figures["smoke"], "seconds per frame": figures["frame s"]}
+        facts |= {"smoke at the end, m³ of density 1": figures["smoke m³"], "seconds per frame": figures["frame s"]}
         if not most and not warnings:
             _note_no_smoke(scene)
     console.show_facts(f"{output}: {scene.name}", facts)

@@ -704,7 +704,10 @@ class Lattice:
         for _ in range(steps):
             now, out = self._buffers
             inputs = [self._n, now, self._solid, self._tau, self._eddy, self._forces, self._done % 2]
-            self.slabs.launch(step_kernel(self._spec), inputs, [self._clock, self._trouble, self._sums, out])
+            outputs = [self._clock, self._trouble, self._sums, out]
+            # Small blocks are faster with solids, large ones without (docs/notes/fluid-speed.md).
+            block_dim = 128 if self._spec.solids else 256
+            self.slabs.launch(step_kernel(self._spec), inputs, outputs, block_dim)
             if self._growth is not None:
                 expand = expand_kernel(self._spec.lattice, self._spec.storage)
                 self.slabs.launch(expand, [self._tables, self._growth], [out])

@@ -228,7 +228,7 @@ def simulate(
         volumes: Format in which each frame is written, too, with the velocity of the air in metres per second:
             `frame_0001.vdb`, or `frame_0001.nvdb`, compressed or as a GPU holds it (nvdb-raw). None: no second file.
         checkpoint_every: Seconds between two saves of the state; 0: after every step.
-        progress: Called after each frame, with the figures `smoke`, the integral of the density over the box, and
+        progress: Called after each frame, with the figures `smoke m³`, the integral of the density over the box, and
             `frame s`, the seconds of the frame; and about twice a second within a frame, without figures.
 
     Returns:
@@ -284,7 +284,7 @@ def simulate(
                 try:
                     if last and progress is not None:
                         mass = float(values[0].sum(dtype=torch.float64)) * scene.grid.voxel**3
-                        meter.report(frame, smoke=mass, frame_s=time.perf_counter() - begin)
+                        meter.report(frame, **{"smoke_m³": mass, "frame_s": time.perf_counter() - begin})
                     elif meter.due(frame - 1):
                         meter.report(frame - 1)
                 except KeyboardInterrupt:

@@ -74,12 +74,13 @@ class Slab:
     number: int = 0
 
 
-def launch_slab(kernel: wp.Kernel, n: wp.vec3i, slab: Slab, inputs: list, outputs: list) -> None:
+def launch_slab(kernel: wp.Kernel, n: wp.vec3i, slab: Slab, inputs: list, outputs: list, block_dim: int = 256) -> None:
     """Launches a kernel with one thread for each cell of a slab of n cells along x, y and z; the first input of the
     kernel, here added, is the index of the slab's first cell."""
     plane = n[1] * n[2]
     inputs = [slab.begin * plane, *inputs]
-    wp.launch(kernel, (slab.end - slab.begin) * plane, inputs=inputs, outputs=outputs, device=slab.device)
+    threads = (slab.end - slab.begin) * plane
+    wp.launch(kernel, threads, inputs=inputs, outputs=outputs, device=slab.device, block_dim=block_dim)
 
 
 @wp.struct

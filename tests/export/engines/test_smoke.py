@@ -125,16 +125,6 @@ def test_godots_billboard_faces_the_viewer(frames, tmp_path):
     np.testing.assert_allclose(run_glsl(text, main, (1, 1), {})[0, 0], [6.0, 7.5, -3.0, 1.0], atol=1e-6)
 
 
-def test_names_of_godots_shader_have_one_meaning(frames, tmp_path):
-    """GLSL lets a parameter or a local hide a uniform; Godot's language doesn't."""
-    export_smoke(random_book(frames), tmp_path, "godot")
-    text = re.sub(r"//.*", "", (tmp_path / "smoke.gdshader").read_text())
-    outer = set(re.findall(r"^(?:uniform|varying) \w+ (\w+)", text, re.MULTILINE))
-    within = re.sub(r"^(uniform|varying).*$", "", text, flags=re.MULTILINE)
-    inner = set(re.findall(r"\b(?:float|vec[234]|int|bool) (\w+)\b(?!\()", within))
-    assert len(outer) == 6 and {"frame", "place", "mip"} <= inner and not outer & inner
-
-
 def test_godots_script_and_imports_parse(frames, tmp_path):
     for padding, mips in ((2, "true"), (0, "false")):
         export_smoke(random_book(frames, padding=padding), tmp_path, "godot")

@@ -97,12 +97,10 @@ def test_what_no_script_lights(tmp_path, monkeypatch):
         export(paper, tmp_path / "kit", "three")
 
 
-def test_three_lights_smoke_as_python_does(tmp_path, browser, serve):
+def test_three_lights_smoke_as_python_does(tmp_path, visit):
     export_three(tmp_path / "kit")
     shutil.copy(Path(__file__).with_name("three_live.html"), tmp_path / "kit" / "index.html")
-    page, smoke, size = browser.new_page(), plume(), 48
-    page.goto(f"{serve(tmp_path / 'kit')}/index.html")
-    page.wait_for_function("window.ready", timeout=20000)
+    page, smoke, size = visit(tmp_path / "kit"), plume(), 48
     given = {"shape": smoke.shape, "voxel": smoke.voxel, "extinction": smoke.extinction}
     given["density"] = smoke.density.flatten().tolist()
     extent = float(np.linalg.norm(smoke.size))
@@ -111,4 +109,3 @@ def test_three_lights_smoke_as_python_does(tmp_path, browser, serve):
     expected = six.shade([Light(tuple(toward), (9.0,) * 3)])[..., 0]
     found = torch.tensor(pixels).reshape(size, size, 4).flip(0)[..., 0]
     assert not error and expected.max() > 0.3 and (found - expected).abs().max() < 2 / 255
-    page.close()

@@ -22,10 +22,26 @@ from wlm.probe.sphere import irradiance
 from wlm.smoke.bundle import bundle
 
 _SIZE = 64
-_PAGE = """<!doctype html>
-<script type="importmap">{"imports": {"three": "/three/build/three.module.js", "three/addons/": "/three/examples/jsm/"}}
+_SHARED = """<!doctype html>
+<script type="importmap">{"imports": {"three": "/node_modules/three/build/three.module.js",
+ "three/addons/": "/node_modules/three/examples/jsm/"}}</script>
+<script>
+// The light of a scene, in floats.
+window.read = (THREE, renderer, scene, camera, width, height = width) => {
+  const target = new THREE.WebGLRenderTarget(width, height, {type: THREE.FloatType});
+  renderer.setRenderTarget(target);
+  renderer.render(scene, camera);
+  const pixels = new Float32Array(4 * width * height), error = renderer.getContext().getError();
+  renderer.readRenderTargetPixels(target, 0, 0, width, height, pixels);
+  renderer.setRenderTarget(null);
+  if (error || parseInt(THREE.REVISION) < 187) throw new Error(`GL ${error}, revision ${THREE.REVISION}`);
+  return Array.from(pixels);
+};
 </script>
-<script type="module">
+"""
+_PAGE = (
+    _SHARED
+    + """<script type="module">
 import * as THREE from 'three';
 import { KTX2Loader } from 'three/addons/loaders/KTX2Loader.js';
 import { LightProbeGridWebGL } from 'three/addons/lighting/LightProbeGridWebGL.js';
@@ -47,39 +63,24 @@ window.draw = async (axis, sign, side) => {
     camera.position.copy(plane.position).addScaledVector(normal, 10);
     camera.up.setComponent(1, 0).setComponent((axis + 1) % 3, 1);
     camera.lookAt(plane.position);
-    const size = SIZE, target = new THREE.WebGLRenderTarget(size, size, { type: THREE.FloatType });
-    renderer.setRenderTarget(target);
-    renderer.render(scene, camera);
-    const pixels = new Float32Array(4 * size * size);
-    renderer.readRenderTargetPixels(target, 0, 0, size, size, pixels);
+    const pixels = read(THREE, renderer, scene, camera, SIZE);
     const axes = [new THREE.Vector3(), new THREE.Vector3(), new THREE.Vector3()];
     camera.matrixWorld.extractBasis(...axes);
-    return { pixels: Array.from(pixels), right: axes[0].toArray(), up: axes[1].toArray(),
-             revision: THREE.REVISION, error: renderer.getContext().getError() };
+    return { pixels, right: axes[0].toArray(), up: axes[1].toArray() };
 };
 window.ready = true;
 </script>
 """
+)
 
 
-@pytest.fixture
-def site(tmp_path, serve):
-    """The grid of a model and three.js."""
+def test_three_shows_what_decode_gives(tmp_path, visit):
+    """At the pixels of six planes: trilinear between the cells' centres, half a cell ahead along the normal."""
     model = random_model(seed=3)
     model.content.net[-27:-24] = 4.0  # biases of L0: light that is nowhere below 0
     export(model, tmp_path, "three", cells=8)
     (tmp_path / "index.html").write_text(_PAGE.replace("SIZE", str(_SIZE)))
-    return model, json.loads((tmp_path / "grid.json").read_text()), f"{serve(tmp_path)}/index.html"
-
-
-def test_three_shows_what_decode_gives(site, browser):
-    """At the pixels of six planes: trilinear between the cells' centres, half a cell ahead along the normal."""
-    model, info, url = site
-    page = browser.new_page()
-    errors = []
-    page.on("pageerror", lambda error: errors.append(str(error)))
-    page.goto(url)
-    page.wait_for_function("window.ready")
+    info, page = json.loads((tmp_path / "grid.json").read_text()), visit(tmp_path)
     low, high = np.array(info["box"])
     count = np.array(info["resolution"])
     cell, side = (high - low) / count, 0.9 * float((high - low).min())
@@ -87,7 +88,6 @@ def test_three_shows_what_decode_gives(site, browser):
     for axis in range(3):
         for sign in (1.0, -1.0):
             drawn = page.evaluate(f"draw({axis}, {sign}, {side})")
-            assert drawn["error"] == 0 and int(drawn["revision"]) >= 187 and not errors
             pixels = np.array(drawn["pixels"]).reshape(_SIZE, _SIZE, 4)
             normal = sign * np.eye(3)[axis]
             along = ((np.arange(_SIZE) + 0.5) / _SIZE - 0.5) * side
@@ -104,20 +104,14 @@ def test_three_shows_what_decode_gives(site, browser):
             want = np.maximum(irradiance(light.reshape(_SIZE, _SIZE, 9, 3), normal[None])[..., 0, :] / np.pi, 0.0)
             assert np.ptp(want) > 0.01 * want.max() > 0.0
             np.testing.assert_allclose(pixels[..., :3], want, atol=2e-3 * want.max())
-    page.close()
 
 
 _KIT_SIZE = 96
-_KIT_PAGE = """<!doctype html>
-<script type="importmap">{"imports": {"three": "/three/build/three.module.js"}}</script>
-<script type="module">
+_KIT_PAGE = (
+    _SHARED
+    + """<script type="module">
 import * as THREE from 'three';
-const renderer = new THREE.WebGLRenderer(), size = SIZE;
-const floats = (target) => {
-  const pixels = new Float32Array(4 * target.width * target.height);
-  renderer.readRenderTargetPixels(target, 0, 0, target.width, target.height, pixels);
-  return Array.from(pixels);
-};
+const renderer = new THREE.WebGLRenderer();
 // A white plane whose second UVs fill the picture, v down, under the light alone.
 window.plane = (apply, name) => {
   const geometry = new THREE.PlaneGeometry(2, 2), uv = geometry.attributes.uv.clone();
@@ -126,21 +120,16 @@ window.plane = (apply, name) => {
   const material = new THREE[`Mesh${name}Material`]({color: 0xffffff});
   apply(material, 1);
   const mesh = new THREE.Mesh(geometry, material);
-  const target = new THREE.WebGLRenderTarget(size, size, {type: THREE.FloatType});
   const camera = new THREE.OrthographicCamera(-1, 1, 1, -1, -1, 1), scene = new THREE.Scene();
   scene.add(mesh);
-  renderer.setRenderTarget(target);
-  renderer.render(scene, camera);
-  const error = renderer.getContext().getError();
-  renderer.setRenderTarget(null);
-  if (error || parseInt(THREE.REVISION) < 187) throw new Error(`GL ${error}, revision ${THREE.REVISION}`);
-  return floats(target);
+  return read(THREE, renderer, scene, camera, SIZE);
 };
 const {load} = await import('./load.js');
 window.light = await load(renderer, THREE);
 window.ready = true;
 </script>
 """
+)
 _LIGHTMAP = """import { loadLightmap } from './lightmap.js';
 export const load = (renderer, THREE) => loadLightmap(new URL('bundle.json', import.meta.url), renderer, THREE);
 """
@@ -152,16 +141,10 @@ export const load = (renderer, THREE) => loadAtlas(new URL('bundle.json', import
 """
 
 
-def opened(browser, folder, serve, load):
+def opened(visit, folder, load):
     (folder / "load.js").write_text(load)
     (folder / "index.html").write_text(_KIT_PAGE.replace("SIZE", str(_KIT_SIZE)))
-    page, errors = browser.new_page(), []
-    page.on("pageerror", lambda error: errors.append(str(error)))
-    page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
-    page.goto(f"{serve(folder)}/index.html")
-    page.wait_for_function("window.ready", timeout=20000) if not errors else None
-    assert not errors
-    return page, errors
+    return visit(folder)
 
 
 def drawn(page, name):
@@ -183,24 +166,22 @@ def filtered(frame):
 
 
 @pytest.mark.parametrize(("kinds", "interpolation"), [((4, 3, 3, 1), "radiance"), ((4, 3, 3, 1), "network")])
-def test_three_shows_the_light_of_any_hour(kinds, interpolation, tmp_path, browser, serve):
+def test_three_shows_the_light_of_any_hour(kinds, interpolation, tmp_path, visit):
     model = random_lightmap(kinds, interpolation=interpolation)
     export(model, tmp_path, "three")
-    page, errors = opened(browser, tmp_path, serve, _LIGHTMAP)
+    page = opened(visit, tmp_path, _LIGHTMAP)
     decoder = model.decoder()
     for time, name in ((0.0, "Basic"), (7.5, "Lambert"), (9.1, "Phong"), (21.7, "Basic")):
         page.evaluate(f"light.setTime({time})")
         expected = filtered(decoder.frame(time))
         # Maps of half floats, between which SwiftShader's filter mixes in floats.
         np.testing.assert_allclose(drawn(page, name), expected, rtol=0, atol=expected.max() / 255)
-    assert not errors
-    page.close()
 
 
-def test_three_adds_light_groups(tmp_path, browser, serve):
+def test_three_adds_light_groups(tmp_path, visit):
     model = random_groups()
     export(model, tmp_path, "three")
-    page, errors = opened(browser, tmp_path, serve, _GROUPS)
+    page = opened(visit, tmp_path, _GROUPS)
     decoder = model.decoder()
     assert page.evaluate("light.groups") == list(model.groups)
     for time, weights in ((0.0, {}), (9.1, {"lamp": 0.0, "sun": [1.0, 0.5, 0.25]}), (21.7, {"lamp": 2.0})):
@@ -210,17 +191,15 @@ def test_three_adds_light_groups(tmp_path, browser, serve):
         decoder.set_weights(weights)
         expected = filtered(decoder.frame(time))
         np.testing.assert_allclose(drawn(page, "Basic"), expected, rtol=0, atol=expected.max() / 255)
-    assert not errors
-    page.close()
 
 
 @pytest.mark.parametrize(
     ("kind", "colour"), [*((kind, "rgb9e5") for kind in KINDS), ("plain", "bc6h"), (MIXED, "mixed")]
 )
-def test_three_shows_an_atlas(kind, colour, tmp_path, browser, serve):
+def test_three_shows_an_atlas(kind, colour, tmp_path, visit):
     model = random_atlas(charts(), kind, colour)
     export(model, tmp_path / "three_js", "three")
-    page, errors = opened(browser, tmp_path / "three_js", serve, _ATLAS)
+    page = opened(visit, tmp_path / "three_js", _ATLAS)
     v, u = np.mgrid[:_KIT_SIZE, :_KIT_SIZE] / _KIT_SIZE + 0.5 / _KIT_SIZE
     uv = np.stack([u, v], -1).reshape(-1, 2).astype(np.float32)
     expected = decode64(model, uv).reshape(_KIT_SIZE, _KIT_SIZE, 3)
@@ -233,18 +212,15 @@ def test_three_shows_an_atlas(kind, colour, tmp_path, browser, serve):
     allowed = 3.0 / 512 * 2 * (1 + 22 * (model.method == "cascade"))
     for name in ("Basic", "Lambert", "Phong"):
         np.testing.assert_allclose(drawn(page, name)[inside], expected[inside], rtol=0, atol=allowed)
-    assert not errors
-    page.close()
 
 
-_SCENE_PAGE = """<!doctype html>
-<script type="importmap">{"imports": {"three": "/three/build/three.module.js", "three/addons/": "/three/examples/jsm/"}}
-</script>
-<script type="module">
+_SCENE_PAGE = (
+    _SHARED
+    + """<script type="module">
 import * as THREE from 'three';
 import { GLTFLoader } from 'three/addons/loaders/GLTFLoader.js';
 import { loadScene } from './scene.js';
-const renderer = new THREE.WebGLRenderer(), size = SIZE;
+const renderer = new THREE.WebGLRenderer();
 const light = await loadScene(new URL('bundle.json', import.meta.url), THREE);
 window.draw = async (name, state) => {
   const { scene } = await new GLTFLoader().loadAsync('mesh.glb');
@@ -257,45 +233,33 @@ window.draw = async (name, state) => {
   light.apply(scene);
   if (below.material !== shared) throw new Error('light of another node');
   light.setState(state);
-  const target = new THREE.WebGLRenderTarget(size, size, {type: THREE.FloatType});
   const camera = new THREE.OrthographicCamera(-1, 1, 1, -1, -1, 1), root = new THREE.Scene();
   root.add(scene);
-  renderer.setRenderTarget(target);
-  renderer.render(root, camera);
-  const pixels = new Float32Array(4 * size * size);
-  renderer.readRenderTargetPixels(target, 0, 0, size, size, pixels);
-  const error = renderer.getContext().getError();
-  if (error || parseInt(THREE.REVISION) < 187) throw new Error(`GL ${error}, revision ${THREE.REVISION}`);
-  return Array.from(pixels);
+  return read(THREE, renderer, root, camera, SIZE);
 };
 window.ready = true;
 </script>
 """
+)
 
 
 @pytest.mark.parametrize(("uv_set", "colour"), [(0, "mixed"), (1, "rgb9e5")])
-def test_three_shows_each_object_its_part(uv_set, colour, tmp_path, browser, serve):
+def test_three_shows_each_object_its_part(uv_set, colour, tmp_path, visit):
     model = scene_folder(tmp_path / "scene", uv_set, colour=colour)
     assert model.colour == colour
     export(model, tmp_path / "out", "three")
     (tmp_path / "out" / "index.html").write_text(_SCENE_PAGE.replace("SIZE", str(_KIT_SIZE)))
-    page, errors = browser.new_page(), []
-    page.on("pageerror", lambda error: errors.append(str(error)))
-    page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
-    page.goto(f"{serve(tmp_path / 'out')}/index.html")
-    page.wait_for_function("window.ready", timeout=20000)
+    page = visit(tmp_path / "out")
     for name, state in (("Basic", 0.0), ("Lambert", 1.0), ("Phong", 1.5), ("Basic", 2.0)):
         found = np.array(page.evaluate(f"draw('{name}', {state})")).reshape(_KIT_SIZE, _KIT_SIZE, 4)[::-1, :, :3]
         expected, inside = expected_picture(model, _KIT_SIZE, state)
         assert inside.mean() > 0.9
         np.testing.assert_allclose(found[inside], expected[inside], rtol=0, atol=expected.max() / 255)
-    assert not errors
-    page.close()
 
 
-_SMOKE_PAGE = """<!doctype html>
-<script type="importmap">{"imports": {"three": "/three/build/three.module.js"}}</script>
-<script type="module">
+_SMOKE_PAGE = (
+    _SHARED
+    + """<script type="module">
 import * as THREE from 'three';
 import { loadSmoke } from './smoke.js';
 const renderer = new THREE.WebGLRenderer();
@@ -317,55 +281,34 @@ window.draw = ({time, loop, width, height, toward, irradiance, sky: [r, g, b], b
   sun.color.setRGB(...irradiance, THREE.LinearSRGBColorSpace);
   sky.color.setRGB(r * Math.PI, g * Math.PI, b * Math.PI, THREE.LinearSRGBColorSpace);
   smoke.setTime(time, loop);
-  const target = new THREE.WebGLRenderTarget(width, height, {type: THREE.FloatType});
-  renderer.setRenderTarget(target);
   renderer.setClearColor(new THREE.Color().setRGB(behind, behind, behind, THREE.LinearSRGBColorSpace), 1);
-  renderer.render(scene, camera);
-  const pixels = new Float32Array(4 * width * height);
-  renderer.readRenderTargetPixels(target, 0, 0, width, height, pixels);
-  const error = renderer.getContext().getError();
-  renderer.setRenderTarget(null);
-  if (error || parseInt(THREE.REVISION) < 187) throw new Error(`GL ${error}, revision ${THREE.REVISION}`);
-  return Array.from(pixels);
+  return read(THREE, renderer, scene, camera, width, height);
 };
 window.ready = true;
 </script>
 """
+)
 
 
-@pytest.fixture
-def opened_book(tmp_path, browser, serve):
-    """Opens a flip book; at the end nothing has gone wrong in its page."""
-    pages, errors = [], []
+def opened_book(visit, folder, book):
+    """Opens a flip book, and returns a function that draws it."""
+    export(bundle(book), folder, "three")
+    (folder / "index.html").write_text(_SMOKE_PAGE)
+    page = visit(folder)
 
-    def open_book(book):
-        export(bundle(book), tmp_path, "three")
-        (tmp_path / "index.html").write_text(_SMOKE_PAGE)
-        page = browser.new_page()
-        pages.append(page)
-        page.on("pageerror", lambda error: errors.append(str(error)))
-        page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
-        page.goto(f"{serve(tmp_path)}/index.html")
-        page.wait_for_function("window.ready", timeout=20000)
+    def drawn(time, width=16, height=12, *, loop=True, behind=0.0):
+        given = {"time": time, "width": width, "height": height, "loop": loop, "behind": behind}
+        given |= {"toward": TOWARD, "irradiance": IRRADIANCE, "sky": SKY}
+        return np.array(page.evaluate("draw", given)).reshape(height, width, 4)[::-1, :, :3]
 
-        def drawn(time, width=16, height=12, *, loop=True, behind=0.0):
-            given = {"time": time, "width": width, "height": height, "loop": loop, "behind": behind}
-            given |= {"toward": TOWARD, "irradiance": IRRADIANCE, "sky": SKY}
-            return np.array(page.evaluate("draw", given)).reshape(height, width, 4)[::-1, :, :3]
-
-        return drawn
-
-    yield open_book
-    for page in pages:
-        page.close()
-    assert not errors
+    return drawn
 
 
-def test_three_shows_what_shade_gives(opened_book):
+def test_three_shows_what_shade_gives(visit, tmp_path):
     """At frames, between them and, where it doesn't begin again, after the last; over black and over light."""
     frames = random_frames()
     book = random_book(frames)
-    drawn = opened_book(book)
+    drawn = opened_book(visit, tmp_path, book)
     for seconds, loop in ((0.0, True), (0.15, True), (0.825, True), (0.4, False), (0.9, False)):
         frame = seconds * book.rate
         frame = frame % 5 if loop else min(frame, 4.0)
@@ -375,10 +318,10 @@ def test_three_shows_what_shade_gives(opened_book):
             np.testing.assert_allclose(drawn(seconds, loop=loop, behind=behind), expected, atol=1.6 / 255)
 
 
-def test_smaller_pictures_read_mips(opened_book):
+def test_smaller_pictures_read_mips(visit, tmp_path):
     """A pixel as large as four is their mean, where the padding allows the mip, and else one place between them."""
     frames = random_frames(seed=1)
-    found = opened_book(random_book(frames, ramp=None))(0.0, 8, 6)
+    found = opened_book(visit, tmp_path, random_book(frames, ramp=None))(0.0, 8, 6)
     want = shown(frames, random_book(frames, ramp=None), 0.0)[..., :3]
     fours = want.reshape(6, 2, 8, 2, 3).mean((1, 3))
     # Mips are rounded to 8 bits once more.

@@ -12,8 +12,8 @@ from wlm.probe.volume.update import update_bundle
 
 _SIZE = 16
 _PAGE = """<!doctype html>
-<script type="importmap">{"imports": {"three": "/three/build/three.webgpu.js", "three/webgpu":
-"/three/build/three.webgpu.js", "three/tsl": "/three/build/three.tsl.js"}}
+<script type="importmap">{"imports": {"three": "/node_modules/three/build/three.webgpu.js", "three/webgpu":
+"/node_modules/three/build/three.webgpu.js", "three/tsl": "/node_modules/three/build/three.tsl.js"}}
 </script>
 <script type="module">
 import * as THREE from 'three/webgpu';
@@ -48,7 +48,7 @@ window.ready = true;
 """
 
 
-def test_three_lights_a_plane_from_the_volume(serve, browser, tmp_path):
+def test_three_lights_a_plane_from_the_volume(visit, tmp_path):
     """After a walk the pixels are what the volume of the same walk gives in Python."""
     random = np.random.default_rng(4)
     place = random.uniform(0.0, 6.0, (300, 3)) * [1.0, 0.3, 1.0]
@@ -58,18 +58,13 @@ def test_three_lights_a_plane_from_the_volume(serve, browser, tmp_path):
     volume = Volume(place, model.decoder(position=place).light(place), live=model.live, budget=64, side=8)
     made = update_bundle(volume, model, frames=5)
     export(made, tmp_path, shader="wgsl")
-    for name, content in (
-        volume_module(volume_glsl(27)) | {"index.html": _PAGE.replace("SIZE", str(_SIZE)).encode()}
-    ).items():
+    files = volume_module(volume_glsl(27)) | {"index.html": _PAGE.replace("SIZE", str(_SIZE)).encode()}
+    for name, content in files.items():
         (tmp_path / name).write_bytes(content)
-    page, errors = browser.new_page(), []
-    page.on("pageerror", lambda error: errors.append(str(error)))
-    page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
-    page.goto(f"{serve(tmp_path)}/index.html")
-    page.wait_for_function("window.ready")
+    page = visit(tmp_path)
     side, centre = 4.0, np.array([3.0, 0.9, 3.0])
     drawn = page.evaluate(f"draw({made.reference['viewpoint'].tolist()}, {centre.tolist()}, {side})")
-    assert drawn["webgpu"] and not errors
+    assert drawn["webgpu"]
     pixels = np.array(drawn["pixels"], np.float32).reshape(_SIZE, _SIZE, 4)[..., :3]
     along = ((np.arange(_SIZE) + 0.5) / _SIZE - 0.5) * side
     z, x = np.meshgrid(along, along, indexing="ij")

@@ -15,6 +15,7 @@ from wlm.export.engines.kit import (
     asset_name,
     check_sides,
     filled,
+    godot_uniforms,
     label,
     picture_entry,
     stacked,
@@ -79,11 +80,14 @@ def _three(bundle: Bundle) -> dict[str, str]:
 
 def _godot(bundle: Bundle) -> dict[str, str]:
     names = [*bundle.textures, "hour", *(["networks"] if "networks" in bundle.buffers else [])]
-    bindings = "".join(f"#define WLM_LIGHTMAP_{name.upper()}_BINDING {i}\n" for i, name in enumerate(names))
-    listed = ", ".join(f'"{name}"' for name in names)
+    # Only two textures are filtered; others, floats among them, cannot be everywhere.
+    shader = re.sub(
+        r"(wlm_lightmap_(?!uvt|planes)\w+) : filter_linear", r"\1 : filter_nearest", godot_uniforms(bundle.shader)
+    )
+    size = f"{bundle.document['width']}, {bundle.document['height']}"
     return {
-        "lightmap.glsl": filled("godot_lightmap.glsl", SHADER=bindings + bundle.shader),
-        "wlm_lightmap.gd": filled("godot_lightmap.gd", NAMES=listed),
+        "lightmap.gdshader": filled("godot_lightmap.gdshader", SHADER=shader, SIZE=size),
+        "wlm_lightmap.gd": filled("godot_lightmap.gd", NAMES=", ".join(f'"{name}"' for name in names)),
         "lit.gdshader": filled("godot_lit.gdshader"),
         README_FILE: filled("godot_lightmap.md", NAME=bundle.name),
     }

@@ -40,7 +40,7 @@ public class WlmSmoke : MonoBehaviour
     }
 
     [ContextMenu("Size of the simulation")]
-    void Resize()
+    public void Resize()
     {
         OnEnable();
         if (read != null)
@@ -78,7 +78,7 @@ public class WlmSmoke : MonoBehaviour
 #if UNITY_EDITOR
     // Imports linear, uncompressed, at the original size: the defaults for colour pictures would change the light.
     [ContextMenu("Import the textures as they are")]
-    void Import()
+    public void Import()
     {
         OnEnable();
         Material material = GetComponent<MeshRenderer>().sharedMaterial;

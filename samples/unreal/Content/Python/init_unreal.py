@@ -1,0 +1,5 @@
+"""The editor runs this file when it starts."""
+
+import wlm_sample
+
+wlm_sample.start()
