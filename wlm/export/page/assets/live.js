@@ -413,7 +413,7 @@ class LiveSmoke {
     }).each;
     const predicted = this.network && made === 'network', planes = predicted ? this.#infer({u_sides, u_rest, u_surface}, width, height) : [u_sides, u_rest];
     const [first, second] = [0, 1].map((u_half) => this.#pass(ROOTS, this.#target(`maps ${u_half}`, width, height, {filter: gl.LINEAR}), {
-      u_planes: planes[u_half], u_half, u_guide: predicted ? 0 : 1, u_hot: volume.heat === undefined ? 0 : 1,
+      u_planes: planes[u_half], u_half, u_guide: predicted ? 0 : 1, u_hot: volume.fields.heat ? 1 : 0,
     }));
     return {first, second};
   }
