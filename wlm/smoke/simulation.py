@@ -78,7 +78,8 @@ def warnings_of(scene: Scene) -> list[str]:
     box = f"it is outside the box from ({') to ('.join(corners)})"
     for i, inlet in enumerate(scene.inlets):
         points = _opening(scene, inlet)
-        cells, others = set(map(tuple, points)), scene.inlets[i + 1 :]
+        cells = set(map(tuple, points))
+        others = [each for each in scene.inlets[i + 1 :] if each.face == inlet.face or inlet.density]
         over = {each.face == inlet.face for each in others if cells <= set(map(tuple, _opening(scene, each)))}
         if over or all(_is_hidden(scene, points, time) for time in _looks(scene, 0.0, end)):
             effect = "its smoke is replaced" if over == {False} else "it is closed"
