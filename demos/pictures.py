@@ -1,5 +1,5 @@
-"""The pictures of README and docs: the street, what `wlm view` and `wlm web` show of the demos' files, and what the
-tutorials leave, with their pages of three.js.
+"""The pictures of README and docs: drawings from data in the repository (`drawings.py`), what `wlm view` and `wlm web`
+show of the demos' files, and what the tutorials leave, with their pages of three.js.
 
     make pictures                           # all, after the demos and the tutorials
     python -m demos.pictures web.png        # some, of what the demos have left
@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import functools
 import http.server
+import inspect
 import io
 import os
 import shutil
@@ -24,10 +25,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image
 
 import wlm
 from benchmarks.plots import digest, stamp
+from demos.drawings import DRAWINGS, SCENES, row, stack
 from demos.tutorials import steps
 from wlm.cli.console import quiet_warp
 from wlm.errors import WlmError
@@ -42,14 +44,11 @@ BROWSERS = ("chromium-headless-shell", "chromium", "chromium-browser", "google-c
 SOFTWARE_GL = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 SOFTWARE_GPU = ("--no-sandbox", "--use-angle=vulkan", "--use-vulkan=swiftshader", "--enable-features=Vulkan")
 SOFTWARE_GPU += ("--enable-unsafe-webgpu", "--use-webgpu-adapter=swiftshader")
-PAPER, INK = "#1b1b1f", "#e8e8e8"
-GAP = 10  # between pictures
 STREET = (7.0, 12.0, 18.75, 22.0)  # hours of the street
 SECOND, VIEW = 2.0, (360, 640)  # of the street: the camera's place by the second of its film, height and width
 
 # By file: what is opened, its options, the view, and the sliders.
 VIEWS: dict[str, tuple[str, dict[str, Any], str, dict[str, float]]] = {
-    "lightmap.png": ("city.wlm", {"original": DATA / "city"}, "light", {"hour": 12.0}),
     "atlas.png": ("room-standard.wlm", {"original": DATA / "atlas" / "room.exr"}, "tiles", {}),
     "probe.png": (
         "street.wlm",
@@ -75,7 +74,6 @@ DEMOS = {
     "ops-bc7.png": "ops_bc7.png",
     "ops-march.png": "ops_march.png",
     "ops-silhouette.png": "ops_silhouette.png",
-    "smoke.png": "smoke/plume.png",
     "smoke-light.png": "smoke/smoke_light.png",
 }
 
@@ -83,14 +81,19 @@ DEMOS = {
 SOURCES = {
     "street.png": ("data/street/**/*",),
     "web.png": ("lightmap.py", "atlas.py", "data/city/*", "data/atlas/*", "../wlm/export/page/assets/page.css"),
-    "lightmap.png": ("lightmap.py", "data/city/*"),
+    "lightmap.png": ("data/street/**/*",),
+    "bake.png": ("data/cornell/*",),
+    "atlas-mips.png": ("data/city/*",),
+    "smoke.png": ("plume.py",),
+    "fire.png": ("../configs/smoke-candle.yaml", "../configs/smoke-explosion.yaml"),
+    "smoke-rabbit.png": ("../configs/smoke-rabbit.yaml", "../configs/meshes/rabbit.ply"),
+    "smoke-fan.png": ("../configs/smoke-fan.yaml", "../configs/meshes/fan.ply"),
     "atlas.png": ("atlas.py", "data/atlas/*"),
     "probe.png": ("probe.py", "data/probes/*"),
     "fluid-control.png": ("fluid_control.py",),
     "ops-bc7.png": ("ops_bc7.py", "data/atlas/*"),
     "ops-march.png": ("ops_march.py", "data/smoke/*"),
     "ops-silhouette.png": ("ops_silhouette.py",),
-    "smoke.png": ("smoke.py", "plume.py"),
     "smoke-light.png": ("smoke_light.py", "plume.py"),
     "tutorial-bake.png": ("data/cornell/*",),
     "tutorial-optimise.png": (),
@@ -101,12 +104,16 @@ SOURCES = {
 
 
 def digests() -> dict[str, str]:
-    """Returns the digest of each picture's sources; a tutorial's commands and code are such, its words are not."""
+    """Returns the digest of each picture's sources, among them the function of a drawing, and the commands and code of
+    a tutorial."""
     found = {}
     for name, patterns in SOURCES.items():
         paths = sorted({path for pattern in patterns for path in HERE.glob(pattern) if path.suffix not in ("", ".md")})
         tutorial = HERE.parent / "docs" / "tutorials" / f"{Path(name).stem.removeprefix('tutorial-')}.md"
         code = repr(list(steps(tutorial))) if name.startswith("tutorial-") else ""
+        if name in DRAWINGS:
+            code = inspect.getsource(DRAWINGS[name])
+            code += repr([SCENES[scene] for scene in SCENES if f'("{scene}")' in code])
         found[name] = digest(code.encode() + b"".join(path.read_bytes() for path in paths))
     return found
 
@@ -149,32 +156,6 @@ def browser(folder: Path, options: Sequence[str] = SOFTWARE_GL) -> Iterator[Brow
         chromium = playwright.chromium.launch(executable_path=program, args=list(options))
         yield Browser(chromium, folder)
         chromium.close()
-
-
-def row(pictures: Sequence[tuple[Image.Image, str]], gap: int = GAP) -> Image.Image:
-    """Pictures of one height side by side, each with its label in a corner."""
-    font = ImageFont.load_default(15)
-    width = sum(picture.width for picture, _ in pictures) + gap * (len(pictures) - 1)
-    result, left = Image.new("RGB", (width, pictures[0][0].height), PAPER), 0
-    for picture, label in pictures:
-        result.paste(picture, (left, 0))
-        if label:
-            pen, place = ImageDraw.Draw(result), (left + 6, 4)
-            box = pen.textbbox(place, label, font)
-            pen.rectangle((box[0] - 4, box[1] - 3, box[2] + 4, box[3] + 3), "#000000")
-            pen.text(place, label, INK, font)
-        left += picture.width + gap
-    return result
-
-
-def stack(pictures: Sequence[Image.Image], gap: int = GAP) -> Image.Image:
-    """Pictures of one width below each other."""
-    height = sum(picture.height for picture in pictures) + gap * (len(pictures) - 1)
-    result, top = Image.new("RGB", (pictures[0].width, height), PAPER), 0
-    for picture in pictures:
-        result.paste(picture, (0, top))
-        top += picture.height + gap
-    return result
 
 
 def street() -> Image.Image:
@@ -280,7 +261,9 @@ def pictures(demos: Path, wanted: Sequence[str]) -> Iterator[tuple[str, Image.Im
                 for name in names:
                     yield name, page_and_phone(pages) if name == "web.png" else tutorial_page(pages, name)
     for name in wanted:
-        if name in TUTORIALS:
+        if name in DRAWINGS:
+            yield name, DRAWINGS[name]()
+        elif name in TUTORIALS:
             yield name, tutorial_row(demos, name)
         elif name in VIEWS:
             yield name, window(demos, name)

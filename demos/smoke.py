@@ -69,7 +69,7 @@ def jet(out: Path, name: str, device: str) -> dict[str, float]:
 
     def note_smoke(progress: Progress) -> None:
         if progress.figures:  # none within a frame
-            amounts.append(progress.figures["smoke"])
+            amounts.append(progress.figures["smoke m³"])
 
     simulate(frames, device=device, progress=note_smoke)
     simulated, clock = time.perf_counter() - clock, time.perf_counter()

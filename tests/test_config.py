@@ -1,6 +1,3 @@
-import os
-import subprocess
-import sys
 from pathlib import Path
 from typing import Literal
 
@@ -95,19 +92,12 @@ def test_an_unknown_profile_lists_the_known_ones(checkout, name):
         profile_path("smoke", "M")
 
 
-def test_a_profile_is_found_in_the_installed_package(tmp_path, monkeypatch):
-    site = tmp_path / "site-packages"
-    (site / "wlm" / "configs").mkdir(parents=True)
-    (site / "wlm" / "configs" / "atlas-M.yaml").touch()
+def test_a_profile_is_found_in_the_installed_package(checkout, monkeypatch):
     # Of another package: a folder of this name beside `wlm` means nothing without a pyproject.toml.
-    (site / "configs").mkdir()
-    (site / "configs" / "atlas-X.yaml").touch()
-    source = Path(wlm.config.__file__)
-    (site / "wlm" / "formats").mkdir()
-    formats = [f"formats/{name}.py" for name in ("__init__", "limits", "reading")]
-    for file in ("__init__.py", "__init__.pyi", "_facade.py", "config.py", "errors.py", *formats):
-        (site / "wlm" / file).write_bytes((source.parent / file).read_bytes())
-    code = "import wlm.config as c; print(c.profile_names('atlas'), c.profile_path('atlas', 'M'))"
-    environment = {**os.environ, "PYTHONPATH": str(site)}
-    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True)
-    assert done.stdout.strip() == f"['M'] {site / 'wlm' / 'configs' / 'atlas-M.yaml'}", done.stderr
+    (checkout / "pyproject.toml").unlink()
+    installed = checkout / "wlm" / "configs"
+    installed.mkdir(parents=True)
+    (installed / "atlas-M.yaml").touch()
+    monkeypatch.setattr(wlm.config.resources, "files", {"wlm.configs": installed}.get)
+    assert (profile_names("atlas"), profile_names("lightmap")) == (["M"], [])
+    assert profile_path("atlas", "M") == installed / "atlas-M.yaml"

@@ -1,4 +1,4 @@
-"""README and tutorials: all of their steps, run as printed in a temporary folder."""
+"""README, tutorials and notebooks: all of their steps, run as printed in a temporary folder."""
 
 import json
 import shlex
@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from builders.running import call
 
+from demos.notebooks import NOTEBOOKS, code_of, digest_of, run
 from demos.tutorials import TUTORIALS, steps
 from wlm.formats.exr import read_exr, write_exr
 from wlm.system import Settings
@@ -72,6 +73,23 @@ def test_all_steps(document, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for step in steps(document):
         take(*step)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_notebooks(path, tmp_path, monkeypatch):
+    (tmp_path / "demos").symlink_to(ROOT / "demos")
+    monkeypatch.chdir(tmp_path)
+    shown = run(code_of(json.loads(path.read_text(encoding="utf-8"))))
+    assert sum("image/png" in output.get("data", {}) for outputs in shown for output in outputs) >= 3
+
+
+def test_notebooks_keep_what_their_code_shows():
+    assert len(NOTEBOOKS) == 3
+    for path in NOTEBOOKS:
+        notebook = json.loads(path.read_text(encoding="utf-8"))
+        fresh = notebook["metadata"]["wlm"]["code"] == digest_of(notebook)
+        assert fresh, f"{path.name}: code changed: run `python -m demos.notebooks {path.stem}`, and look at it"
 
 
 def test_readme_is_short_and_every_step_is_found():

@@ -15,7 +15,7 @@ scene that all four systems light over a day.
 
 from wlm._facade import facade
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 __getattr__, __dir__, _public = facade(__name__, __file__)
 

@@ -28,7 +28,7 @@ PACKAGES = (
     "wlm.export",
 )
 _OUTSIDE = re.compile(
-    r"\[([^\]]+)\]\((?:\.\./)*(?:wlm|wlm_kernels|benchmarks|demos|tests|configs|LICENSE|README\.md)(?:[/#][^)]*)?\)"
+    r"\[([^\]]+)\]\((?:\.\./)*(?:wlm|wlm_kernels|benchmarks|demos|notebooks|tests|configs|LICENSE|README\.md)(?:[/#][^)]*)?\)"
 )
 
 

@@ -13,6 +13,7 @@ from builders.small_sets import HOURS, moving_light, tiny_profile
 from PIL import Image
 
 import wlm
+from wlm.cli.console import COMPILING
 from wlm.formats.exr import read_exr, write_exr
 from wlm.lightmap import codec
 
@@ -59,6 +60,18 @@ def test_the_version_is_quick_to_tell():
     )
     done = subprocess.run([sys.executable, "-c", code], env=os.environ | {"PYTHONPATH": str(ROOT)}, check=False)
     assert done.returncode == 0
+
+
+def test_a_run_that_compiles_kernels_says_so_once(tmp_path):
+    text = "import warp as wp\nfrom wlm.cli.console import quiet_warp\nquiet_warp()\n"
+    for n in (1, 2):
+        text += f"@wp.kernel(module='unique')\ndef k{n}(a: wp.array(dtype=float)):\n    a[0] = float({n})\n"
+        text += f"wp.launch(k{n}, 1, [wp.zeros(1, dtype=float, device='cpu')], device='cpu')\n"
+    (tmp_path / "script.py").write_text(text)
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "WARP_CACHE_PATH": str(tmp_path / "cache")}
+    for said in (f"{COMPILING}\n", ""):
+        run = spawn(code="import runpy\nrunpy.run_path('script.py')", env=environment, cwd=tmp_path)
+        assert run.communicate() == ("", said)
 
 
 def test_compress_prints_one_table(folder, profile, tmp_path):

@@ -223,7 +223,7 @@ def test_hard_scenes(case, tmp_path):
     reports = []
     simulate(open_frames(tmp_path / "a", scene), progress=reports.append)
     # A slow frame has reports of its own, without figures or with those of the last one.
-    amounts = {report.done: report.figures["smoke"] for report in reports if report.figures}
+    amounts = {report.done: report.figures["smoke m³"] for report in reports if report.figures}
     last = load_frames(tmp_path / "a").load(2)
     assert len(amounts) == 2 and last.warnings == ()
     assert (amounts[2] > 0) == (case in ("hot", "bricks of halves"))

@@ -43,8 +43,8 @@ from wlm.smoke.transport.orders import orders_march
 from wlm.view.smoke import picture
 
 BOX = {"shape": "box"}
-QUICK = range(8)
-"""Random scenes of every run."""
+QUICK = (*range(5), 111, 121, 129)
+"""Random scenes of every run; in the last three an inlet or a body was once without effect or too fast."""
 GRID = {"cells": [4, 4, 4], "cell": 1}
 
 

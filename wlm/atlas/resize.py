@@ -8,6 +8,7 @@ from scipy import sparse
 
 from wlm.formats.exr import HALF_MAX
 
+_Array = torch.Tensor | np.ndarray
 # Conjugate gradient rounds: 5 are within 0.1 dB of this number, and three times as many gain nothing.
 _ROUNDS = 20
 # Regularisation towards the box filter's result: it determines texels that no chart reads, and hardly changes others.
@@ -26,12 +27,7 @@ def fitting_size(height: int, width: int, budget: float, block: tuple[int, int],
 
 
 def resized(
-    filled: torch.Tensor | np.ndarray,
-    mask: torch.Tensor | np.ndarray,
-    height: int,
-    width: int,
-    filter: str = "fit",
-    device: str = "cpu",
+    filled: _Array, mask: _Array, height: int, width: int, filter: str = "fit", device: str = "cpu"
 ) -> torch.Tensor:
     """Returns a smaller lightmap, to be read bilinearly, float64 [height, width, 3] in [0, 65504]. `filled` is the
     lightmap without gaps. The filter "box" averages the lightmap over the new texels' squares; "fit" minimises the

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 _PLAIN_WIDTH = 10_000  # characters of a line in a file or a pipe, so that no cell of a table wraps
 _PLAIN_REPORTS = 10  # lines of progress in a log
 _NO_RESULTS = {"scene.json", "six.partial"}  # files of a sequence without a frame: the scene, the settings of a run
+COMPILING = "compiling kernels (first run, up to a minute; later runs start at once)"
 _MISSING_DRIVER = b"Could not find or load the NVIDIA CUDA driver"
 
 
@@ -203,10 +204,10 @@ def _remove_without_result(folder: Path) -> None:
 
 
 def quiet_warp() -> None:
-    """Starts Warp without its banner, its notes on compilation, and its line about a missing GPU driver.
+    """Starts Warp without its banner, its notes on modules, and its line about a missing GPU driver.
 
     A missing driver does not matter on the CPU, and `--device cuda` raises an error about it anyway. One line says that
-    kernels will be compiled if Warp's cache is empty.
+    kernels are compiled, once some are.
     """
     import warp as wp
 
@@ -214,9 +215,20 @@ def quiet_warp() -> None:
     # Warp's C library writes to the stderr of the process, whatever the settings are.
     with captured_stderr(lambda line: _MISSING_DRIVER in line):
         wp.init()
-    cache = Path(wp.config.kernel_cache_dir)
-    if not (cache.is_dir() and any(cache.iterdir())):
-        note("compiling kernels (first run; cached afterwards)")
+    _announce_compilation()
+
+
+@functools.cache
+def _announce_compilation() -> None:
+    from warp._src.context import Module
+
+    generate, announce = Module._run_codegen, functools.cache(lambda: note(COMPILING))
+
+    def run(self: Module, *arguments: Any) -> Any:
+        announce()
+        return generate(self, *arguments)  # which Warp calls only for a module that its cache does not hold
+
+    Module._run_codegen = run
 
 
 @contextmanager

@@ -337,9 +337,9 @@ def _note_worst(report: "SheetReport") -> None:
     }
     for what, worst in places.items():
         if worst is not None:
-            console.note(f"worst PSNR{what}: {worst['psnr']:.2f} dB, tile {worst['tile']} at {worst['time']:g}")
+            console.note(f"worst PSNR{what}: {worst['psnr']:.2f} dB, tile {worst['tile']} at time {worst['time']:g}")
     if (worst := report.worst_view) is not None:
-        place = f"camera {worst['view']} at {worst['time']:g}"
+        place = f"camera {worst['view']} at time {worst['time']:g}"
         console.note(f"worst view: {worst['psnr']:.2f} dB, FLIP {worst['flip']:.4f}, {place}")
     reasons = ", ".join(f"{count} {reason}" for reason, count in report.not_scored.items() if count)
     if reasons:

@@ -78,7 +78,8 @@ def warnings_of(scene: Scene) -> list[str]:
     box = f"it is outside the box from ({') to ('.join(corners)})"
     for i, inlet in enumerate(scene.inlets):
         points = _opening(scene, inlet)
-        cells, others = set(map(tuple, points)), scene.inlets[i + 1 :]
+        cells = set(map(tuple, points))
+        others = [each for each in scene.inlets[i + 1 :] if each.face == inlet.face or inlet.density]
         over = {each.face == inlet.face for each in others if cells <= set(map(tuple, _opening(scene, each)))}
         if over or all(_is_hidden(scene, points, time) for time in _looks(scene, 0.0, end)):
             effect = "its smoke is replaced" if over == {False} else "it is closed"
@@ -228,7 +229,7 @@ def simulate(
         volumes: Format in which each frame is written, too, with the velocity of the air in metres per second:
             `frame_0001.vdb`, or `frame_0001.nvdb`, compressed or as a GPU holds it (nvdb-raw). None: no second file.
         checkpoint_every: Seconds between two saves of the state; 0: after every step.
-        progress: Called after each frame, with the figures `smoke`, the integral of the density over the box, and
+        progress: Called after each frame, with the figures `smoke m³`, the integral of the density over the box, and
             `frame s`, the seconds of the frame; and about twice a second within a frame, without figures.
 
     Returns:
@@ -284,7 +285,7 @@ def simulate(
                 try:
                     if last and progress is not None:
                         mass = float(values[0].sum(dtype=torch.float64)) * scene.grid.voxel**3
-                        meter.report(frame, smoke=mass, frame_s=time.perf_counter() - begin)
+                        meter.report(frame, **{"smoke_m³": mass, "frame_s": time.perf_counter() - begin})
                     elif meter.due(frame - 1):
                         meter.report(frame - 1)
                 except KeyboardInterrupt:

@@ -5,7 +5,6 @@ from collections.abc import Sequence
 import numpy as np
 from PIL import Image
 
-from wlm.errors import WlmError
 from wlm.formats.gltf import GltfDocument, GltfPrimitive, reported, texture_transform, vertex_colours
 from wlm.formats.gltf_slots import texture_picture
 
@@ -29,10 +28,7 @@ def pack_materials(document: GltfDocument, primitives: Sequence[GltfPrimitive]) 
             material = {} if each.material is None else document.item("materials", each.material)
             place = np.zeros((len(each.position), 3), np.float32)
             if used := material.get("pbrMetallicRoughness", {}).get("baseColorTexture"):
-                where = f"{document.path}: materials[{each.material}]"
-                uv_set, moved = texture_transform(where, used)
-                if (uv_set or 0) not in each.uv:
-                    raise WlmError(f"{where}: expected UVs TEXCOORD_{uv_set or 0} of its texture in {each.name}")
+                uv_set, moved = texture_transform(f"{document.path}: materials[{each.material}]", used)
                 if used["index"] not in pictures:
                     pictures[used["index"]] = texture_picture(document, used["index"])
                 place[:, :2] = each.uv[uv_set or 0] @ moved[:, :2].T + moved[:, 2]
