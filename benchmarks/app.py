@@ -252,7 +252,10 @@ def report(
         Path | None, output_option("INDEX.md", "Index to write; the pages go to a folder beside it. Default: print.")
     ] = None,
 ) -> None:
-    """Convert result files to Markdown: all rows, printed; or, with an output, an index and a page for each system."""
+    """Convert result files to Markdown: all rows, printed; or, with an output, an index and a page for each system.
+
+    For the index of the documents, `docs/results.md`, the plots of the documents are drawn too.
+    """
     from benchmarks import pages, read_runs, tables
 
     if output is None:
@@ -261,8 +264,11 @@ def report(
                 show_text(f"## `{path.name}`: `{run.environment['command']}`\n\n{tables(run.rows)}")
         return
     check_output(output, ".md")
+    from benchmarks.plots import IMAGES, draw_all
     from wlm.formats.atomic import atomic_write
 
+    if output.resolve().parent == IMAGES.parent:
+        draw_all()
     for name, page in pages(files, output).items():
         path = output.parent / name
         path.parent.mkdir(exist_ok=True)

@@ -44,8 +44,10 @@ from wlm.smoke.camera import Camera
 from wlm.smoke.codec import open_network
 from wlm.smoke.decode import Decoder as NetworkDecoder
 from wlm.smoke.march.six_way import bake_coarse, coarse_march, guide
+from wlm.smoke.scene import load_scene, make_camera
 from wlm.smoke.shading import Light
 from wlm.smoke.transport.orders import scatter
+from wlm.view.smoke import Drawing
 from wlm_kernels.fluid import advection, advection_places
 from wlm_kernels.lightmap.features import INPUTS
 from wlm_kernels.smoke.settings import March
@@ -312,6 +314,18 @@ def _marched(name: str, smoke_edge: int) -> Callable[[str, int], tuple[Callable[
     return make
 
 
+def _shadows(device: str, pixels: int) -> tuple[Callable[[], object], Work]:
+    """Shadows of jet-sphere's obstacle under its two lights, on a plane through the box's centre."""
+    scene, side = load_scene("jet-sphere"), math.isqrt(pixels)
+    settings = scene.camera.model_copy(update={"resolution": side})
+    camera = make_camera(settings, scene.grid.origin, scene.grid.size)
+    lights = [each.light() for each in scene.lights]
+    drawing = Drawing(camera, lights, obstacles=scene.obstacles, device=device)
+    away = np.subtract(camera.position, scene.grid.origin + 0.5 * scene.grid.size) @ camera.toward
+    surface = torch.full((side, side), float(away), device=device)
+    return lambda: drawing.draw_shadows(surface), Work(bytes=4.0 * (1 + len(lights)) * pixels)
+
+
 def _network(device: str, pixels: int) -> tuple[Callable[[], object], Work]:
     side = math.isqrt(pixels)
     model = open_network()
@@ -357,6 +371,7 @@ CASES: dict[str, Case] = {
     "smoke, guide": Case(_marched("guide", 400), "pixels", _SQUARES[:4], (32**2, 64**2)),
     "smoke, six ways": Case(_marched("six ways", 400), "pixels", _SQUARES[:4], (32**2, 64**2)),
     "smoke, all orders": Case(_marched("all orders", 400), "pixels", _SQUARES[:4], (32**2, 64**2)),
+    "smoke, shadows of two lights": Case(_shadows, "pixels", _SQUARES[:4], (32**2, 64**2)),
     "smoke, network fast": Case(_network, "pixels", _SQUARES[:4], (32**2, 64**2), 1, False),
 }
 """The cases by name."""

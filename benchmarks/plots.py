@@ -80,6 +80,11 @@ def _atlas(pattern: str) -> Curve:
     return Curve("nvidia-h200", "atlas", "mean over 18 lightmaps", pattern)
 
 
+def _sweep(setting: str) -> Curve:
+    scene = "mean over 4 lightmaps, ablation of cascade"
+    return Curve("nvidia-h200", "atlas", scene, f"(ablation whole|sweep {setting} .*)")
+
+
 def _city(pattern: str, file: str = "nvidia-h200") -> Curve:
     return Curve(file, "lightmap", "city", pattern)
 
@@ -106,6 +111,15 @@ PLOTS: dict[str, Lines] = {
             "BC6H, our encoder": _atlas("BC6H, our encoder bits of standard.*"),
             "BC6H": _atlas("BC6H bits of standard.*"),
             "downsampling": _atlas("downsampling bits of standard.*"),
+        },
+    ),
+    "bench-atlas-sweep.png": Lines(
+        "sizes of the cascade (the paper's figure 7), mean over 4 lightmaps by day",
+        "bpp",
+        {
+            "ε from 0.3 to 0.7": _sweep("scale"),
+            "ε_p from 0.2 to 0.8": _sweep("colour_scale"),
+            "ε_c from 0.3 to 1.0": _sweep("lut_scale"),
         },
     ),
     "bench-lightmap.png": Lines(

@@ -248,7 +248,7 @@ def _fly(smoke: Any, grid: _Grid, p: wp.vec3, d: wp.vec3, limit: float, random: 
             w.t += left / w.most
             at = p + w.t * d
             if smoke.emission > 0.0:
-                glow += smoke.emission * density_at(smoke.temperature, at) / w.most
+                glow += smoke.emission * density_at(smoke.temperature, smoke, at) / w.most
             random = following(random)
             found = smoke.extinction * drawn(smoke.density, at, random)
             random = following(random)

@@ -18,6 +18,7 @@ _TENSORS = {
     wp.uint8: (torch.uint8, ()),
     float: (torch.float32, ()),
     wp.int64: (torch.int64, ()),
+    wp.float16: (torch.float16, ()),
     wp.vec2: (torch.float32, (2,)),
     wp.vec4: (torch.float32, (4,)),
 }

@@ -41,7 +41,7 @@ def test_run_is_what_its_stages_are_one_by_one(scene, tmp_path):
         error = np.abs(made - staged)
         assert (error > 2).mean() < 0.02, number
     call("smoke", "run", scene, "-o", tmp_path / "net", "--network", shipped(), "--frames", 1)
-    assert np.abs(png(tmp_path / "net" / "run_0001.png") - png(tmp_path / "run" / "run_0001.png")).mean() < 6
+    assert np.abs(png(tmp_path / "net" / "run_0001.png") - png(tmp_path / "run" / "run_0001.png")).mean() < 10
 
 
 @pytest.mark.slow

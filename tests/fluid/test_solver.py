@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import warp as wp
 
 from wlm import fluid
@@ -98,6 +99,9 @@ def test_bricks_are_the_smoke_of_all_cells(scheme: str, device: str):
     for numbers, values in (dense.bricks(), sparse.bricks()):
         assert len(numbers) * 512 <= sizes[-1] and len(values) == 2 and values[0].shape == (len(numbers), 8, 8, 8)
     assert all((a == b).all() for a, b in zip(dense.bricks()[1], sparse.bricks()[1], strict=True))
+    whole, part = (each.frame() for each in (dense, sparse))
+    assert part.shape == whole.shape and part.places is not None and whole.places is None
+    assert torch.equal(torch.cat(list(part.slabs(part.temperature))), whole.temperature)
 
 
 def test_bricks_take_memory_where_smoke_is(device: str, monkeypatch: pytest.MonkeyPatch):

@@ -94,7 +94,7 @@ def test_a_pixel_by_float64(device: str):
     x = volume.extinction * h * trilinear(density, ray)
     passed = np.cumsum(x) - x
     share = np.exp(-passed) * -np.expm1(-x)
-    result = _march(volume, camera, step=0.1, spacing=1.0, light_step=0.1, jitter=0.0, cutoff=0.0)
+    result = _march(volume, camera, step=0.1, spacing=0.5, jitter=0.0, cutoff=0.0)
     for name, light in (("right", right), ("left", -right), ("top", up), ("bottom", -up)):
         tau = volume.extinction * h * trilinear(density, ray[:, None] + way[:, None] * light).sum(1)
         assert float(result[name]) == pytest.approx(float((share * np.exp(-tau)).sum()), rel=0.01)
@@ -161,7 +161,7 @@ def test_nodes_are_bounded(device: str):
     volume = _blob((12, 9, 10), device)
     camera = _camera(volume)
     expected = _planes(volume, camera, step=1.0, spacing=0.25)
-    assert torch.equal(_planes(volume, camera, step=1.0, spacing=0.01, light_step=0.25), expected)
+    torch.testing.assert_close(_planes(volume, camera, step=1.0, spacing=0.01), expected, rtol=0, atol=2e-3)
     for shape, spacing in (((400, 400, 400), 1.0), ((10**6, 1, 1), 5.0), ((2, 30000, 30000), 1e-3)):
         box = SimpleNamespace(origin=np.zeros(3), voxel=1.0, shape=shape)
         view = _camera(volume, toward=VIEWS["diagonal"]).view(box)

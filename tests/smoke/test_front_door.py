@@ -38,8 +38,6 @@ def test_a_predictor_for_many_frames(smoke, monkeypatch):
     again = [predictor(smoke, camera, 1) for camera in cameras]
     assert all(torch.equal(a.lightmaps, b.lightmaps) for a, b in zip(first, again, strict=True))
     assert not torch.equal(predictor(smoke, cameras[0], 2).lightmaps, first[0].lightmaps)
-    # Of smoke as smooth as this, on a grid as small, the march says all.
-    assert float(predictor.share) < 0.2 and "its guide, the coarse march, is as accurate" in predictor.note()
 
 
 def test_a_network_of_extreme_weights_is_an_error(smoke):

@@ -1,20 +1,24 @@
 """The march to each light: against a march from every sample, the path tracer, and six-way lightmaps."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from builders.smoke_plumes import facing
+import warp as wp
+from builders.smoke_plumes import facing, plume
 from reference.single_light import lit
 
 from benchmarks.smoke_tracing import trace
 from demos.plume import make_plume
-from wlm.fluid.volume import from_array
+from wlm.fluid.volume import from_array, gather
 from wlm.smoke.camera import Camera
-from wlm.smoke.march.six_way import bake
+from wlm.smoke.march.motion import motion
+from wlm.smoke.march.six_way import bake, bake_coarse, guide
 from wlm.smoke.shading import Light, PointLight, sky_lights
 from wlm.smoke.transport.lighting import fine_march, light_smoke
+from wlm.smoke.transport.orders import scatter
 from wlm_kernels.smoke.settings import March
 
 WAYS = [(1.0, 0.7, 0.8), (-0.3, -0.9, 0.5), (0.0, 0.0, -1.0)]
@@ -48,6 +52,34 @@ def test_point_lights_against_the_tracer(device: str, inside: bool):
     assert abs(float(made.mean() / traced.total.mean()) - 1) < 0.01
     assert rms(made, traced.total) < 0.04
     assert not made[..., 2].any()
+
+
+@pytest.mark.parametrize("half", [False, True])
+def test_smoke_in_bricks_is_lit_as_in_all_voxels(device: str, half: bool):
+    """Every march of bricks gives the light of the dense volume; the box is no whole number of bricks."""
+    dense = plume(hot=True, device=device)
+    if half:
+        dense = replace(dense, density=dense.density.half(), temperature=dense.temperature.half())
+    numbers, values = gather([dense.density, dense.temperature])
+    places = torch.zeros(3 * 3 * 3, dtype=torch.int32, device=device)
+    places[numbers.long()] = torch.arange(1, len(numbers) + 1, dtype=torch.int32, device=device)
+    density, temperature = (torch.cat([torch.zeros_like(part[:1]), part]) for part in values)
+    where = {"places": places.view(3, 3, 3), "cells": dense.shape}
+    bricks = replace(dense, density=density, temperature=temperature, **where)
+    assert 1 < len(density) < 27 and bricks.shape == dense.shape and bricks.thickness == pytest.approx(dense.thickness)
+    camera = facing(dense, (0.4, 0.3, 1.0), 16)
+    lights = [Light((1.0, 0.5, 0.2)), PointLight((-0.5, 0.9, 0.3), (1.0, 2.0, 3.0))]
+    velocity = wp.array(np.full((5, 6, 5, 3), 0.1), dtype=wp.vec3, device=device)
+    for march in (
+        lambda volume: scatter(volume, camera, lights).shade(),
+        lambda volume: bake(volume, camera, estimate=False).lightmaps,
+        lambda volume: bake_coarse(volume, camera, March(2.5)).lightmaps,
+        lambda volume: guide(volume, camera, March(3.0)).maps,
+        lambda volume: motion(volume, velocity, camera, reach=0.2),
+    ):
+        part, whole = march(bricks), march(dense)
+        assert whole.any()
+        torch.testing.assert_close(part, whole, rtol=1e-5, atol=1e-6)
 
 
 @pytest.mark.parametrize("z", [4.0, 4.5])

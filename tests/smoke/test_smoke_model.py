@@ -11,18 +11,16 @@ from builders.smoke_plumes import plume
 from builders.smoke_samples import random_model, small_pool
 
 import wlm
-from demos.plume import make_plume
 from wlm.errors import WlmError
 from wlm.fluid.volume import from_array
 from wlm.metrics import psnr_from_mse
 from wlm.smoke import codec
-from wlm.smoke.camera import Camera
 from wlm.smoke.codec import open_network, shipped
 from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.march.six_way import bake, bake_coarse
 from wlm.smoke.model import SmokeModel, parameter_count
 from wlm.smoke.network.planes import GUIDES, OPACITY_PLANE, PLANES, encode_lightmaps
-from wlm.smoke.network.prediction import SmokePredictor, predict
+from wlm.smoke.network.prediction import predict
 from wlm.smoke.network.settings import DatasetSettings, NetworkSettings
 from wlm.smoke.network.unet import ADAPTERS, NafBlock, SixWayNetwork
 from wlm.smoke.scene import CameraSettings, make_camera
@@ -179,25 +177,5 @@ def test_the_network_that_ships_is_better_than_the_march_that_it_reads():
     def score(six: SixWay) -> float:
         return psnr_from_mse(float((encode_lightmaps(six)[:OPACITY_PLANE] - target).square().mean()), 1.0)
 
-    # 43.3 dB against 38.3, on the CPU, for 256 pixels. A network that learned something else is shut out.
+    # 43.3 dB against 38.3, on the CPU, for 256 pixels.
     assert score(predict(volume, camera, model)) > score(coarse) + 3.5 > 41.0
-    other = random_model(0.02, **model.settings.model_dump()).network
-    found = score(predict(volume, camera, SmokeModel(other.eval(), model.summary)))
-    assert score(coarse) - 0.05 < found < score(coarse) + 1.0
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("voxels", [32, 128])
-def test_no_grid_makes_the_network_worse_than_the_march_that_it_reads(voxels):
-    """On smooth smoke the network alone loses 10 dB, and the gate gives it little weight."""
-    volume = make_plume(voxels, hot=True, extinction=14.0)
-    camera = Camera.around(volume, toward=(0.3, 0.2, 1.0), pixels=64)
-    predictor = SmokePredictor()
-    target = encode_lightmaps(bake(volume, camera, step=0.5, estimate=False))
-    coarse = encode_lightmaps(bake_coarse(volume, camera, open_network().dataset.look(volume.shape)))
-    made = encode_lightmaps(predictor(volume, camera))
-    for low, high in ((0, 6), (6, 7), (7, 8)):
-        error, before = (float((planes[low:high] - target[low:high]).square().mean()) for planes in (made, coarse))
-        # The march is within 2e-7, and rounding to 8 bits is 1.3e-6: a tenth of this cannot be seen.
-        assert error < 1.02 * before + 1e-7
-    assert float(predictor.share) < 0.3

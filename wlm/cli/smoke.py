@@ -237,11 +237,12 @@ def light(
     own, twelve = parse_lights(lights, points, around)
     console.quiet_warp()
     from wlm.formats.exr import write_exr
+    from wlm.interop import device_name
     from wlm.smoke.shading import Light
     from wlm.smoke.transport.lighting import LitSmoke, light_smoke
     from wlm.smoke.transport.orders import ScatteredSmoke, orders_march, scatter
     from wlm.view.pictures import contact_sheet, save_png, to_bytes
-    from wlm.view.smoke import picture
+    from wlm.view.smoke import Drawing
 
     frames = options.open(smoke)
     camera = options.view(frames, orthographic=False)
@@ -259,14 +260,20 @@ def light(
             thickness = max(thickness, volume.thickness)
             view, looks = frames.view(camera, volume), frames.looks(frame)
             march, lamps = orders_march(volume, g), [*own, *twelve]
+            extra: dict[str, Any] = {} if looks is None else {"background": looks.background, "ramp": looks.ramp}
+            if looks is not None:
+                extra["obstacles"] = looks.obstacles
+            extra |= {"albedo": colour, "device": device_name(volume.device)} | (
+                {} if behind is None else {"background": behind}
+            )
+            drawing = Drawing(view, lamps, **extra)
+            drawing.move(0.0 if looks is None else looks.time)
+            volume = drawing.among(volume)
             if orders == "single":
                 made: LitSmoke | ScatteredSmoke = light_smoke(volume, view, lamps, march)
             else:
                 made = scatter(volume, view, lamps, colour, march=march)
-            extra: dict[str, Any] = {} if looks is None else {"background": looks.background, "ramp": looks.ramp}
-            if looks is not None:
-                extra |= {"obstacles": looks.obstacles, "time": looks.time}
-            image = picture(made, albedo=colour, **extra | ({} if behind is None else {"background": behind}))
+            image = drawing(made)
             path = file(frame)
             if path.suffix.lower() == ".exr":
                 write_exr(path, image.cpu().numpy())
@@ -305,7 +312,7 @@ def run(
     """Simulate a scene, light it and draw it frame by frame, without intermediate files.
 
     The lights and the fire of the scene illuminate the smoke with all orders of scattering. A table shows the median
-    time of each stage; on a GPU, after some frames, one CUDA graph does all lighting stages.
+    time of each stage.
     """
     check_white(white)
     if orders == "all" and network is not None:

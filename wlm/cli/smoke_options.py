@@ -256,7 +256,7 @@ def write_lightmaps(
     columns = ["file", "pixels with smoke", "their mean light", *(["largest error of light", "RMS error"] * errors)]
     rows = table(str(frames.path), columns)
     numbers = [each for each in frames.numbers if files is None or each not in files.done]
-    made: dict[int, tuple[Any, ...]] = {}
+    made: dict[int, tuple[str, ...]] = {}
     thickness = [0.0]
 
     def job(frame: int) -> tuple[Any, ...]:
@@ -270,7 +270,7 @@ def write_lightmaps(
     tasks = [Task((frame,), 1, partial(job, frame)) for frame in numbers]
     with running("six", None if files is None else files.partial, "frame", whole=False) as progress:
         meter = Meter(progress, "frames", len(tasks), every=0.0)
-        for task, (six, looks, said) in run((FrameMaker, *arguments), tasks, meter, where):
+        for task, (six, looks) in run((FrameMaker, *arguments), tasks, meter, where):
             (frame,) = task.numbers
             path = output if files is None else files.file(frame)
             for fault in axis_faults(six.lightmaps):
@@ -279,16 +279,13 @@ def write_lightmaps(
             covered = six.transparency < 0.99
             mean = float(six.lightmaps[:, covered].mean()) if covered.any() else None
             row = [escape(path.name), f"{float(covered.float().mean()):.1%}", number(mean, ".4g")]
-            made[frame] = said, *row, *((f"{six.error.largest:.2g}", f"{six.error.rms:.2g}") if errors else ())
-    ordered = [made[frame] for frame in sorted(made)]
-    for _, *cells in ordered:
-        rows.add_row(*cells)
+            made[frame] = *row, *((f"{six.error.largest:.2g}", f"{six.error.rms:.2g}") if errors else ())
+    for frame in sorted(made):
+        rows.add_row(*made[frame])
     if files is not None:
         files.finish()
     show(rows)
     note_thickness(frames, thickness[0])
-    if ordered and ordered[-1][0]:
-        note(ordered[-1][0])
 
 
 def note_thickness(frames: "Frames", thickness: float) -> None:

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import torch
 import warp as wp
+from torch.nn.functional import pad
 
 from wlm.errors import WlmError
 from wlm.fluid.bricks import INDEX_BYTES, BrickPool, require_memory
@@ -513,8 +514,8 @@ class Solver:
         cell: float = 1.0,
         origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
     ) -> DensityVolume:
-        """Returns the smoke as a volume of all cells. Without bricks it shares the solver's memory and is valid until
-        the next step; with bricks it is a copy.
+        """Returns the smoke as a volume. Without bricks it shares the solver's memory and is valid until the next step;
+        with bricks it is a copy of those that have smoke.
 
         Args:
             extinction: Extinction per length of the world at density 1.
@@ -522,15 +523,17 @@ class Solver:
             cell: Edge of a cell of the lattice in the world's unit.
             origin: Corner of the domain in the world.
         """
-        heat = self.temperature
-        return DensityVolume(
-            density=wp.to_torch(self.density),
-            extinction=extinction,
-            voxel=cell * self._box.voxel,
-            origin=origin,
-            temperature=None if heat is None else wp.to_torch(heat),
-            emission=emission,
-        )
+        where: dict[str, Any] = {"voxel": cell * self._box.voxel, "origin": origin}
+        if self._pool is None:
+            values = [wp.to_torch(part) for part in (self.density, self.temperature) if part is not None]
+        else:
+            numbers, values = self.bricks()
+            values = [pad(part, (0, 0) * 3 + (1, 0)) for part in values]
+            places = torch.zeros(math.prod(self._box.bricks), dtype=torch.int32, device=numbers.device)
+            places[numbers.long()] = torch.arange(1, len(numbers) + 1, dtype=torch.int32, device=numbers.device)
+            where |= {"places": places.view(*self._box.bricks), "cells": self.shape}
+        heat = values[1] if self._grids["temperature"] else None
+        return DensityVolume(values[0], extinction, temperature=heat, emission=emission, **where)
 
     def setup(self) -> SmokeSetup:
         """Returns the settings, with a copy of the obstacles' cells."""

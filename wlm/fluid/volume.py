@@ -8,7 +8,7 @@ A grid's density has no unit: the extinction per length is `extinction` times th
 
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -31,6 +31,7 @@ from wlm.formats.reading import FileBytes, open_file, read_file
 from wlm.formats.vdb import LARGEST, GridHead, VdbFile
 from wlm.formats.vdb_writing import encode_vdb
 from wlm.interop import check_device, to_warp
+from wlm_kernels.smoke.march import Solid
 
 EDGE = 8
 """Voxels along an edge of a brick."""
@@ -86,6 +87,10 @@ class DensityVolume:
         emission: Light emitted per unit of length at temperature 1.
         kelvin: Whether the file has kelvins; the temperature is then the light of black bodies, 1 at 1,500 kelvin.
         warnings: The values that were repaired, one line for each kind.
+        places: int32 tensor [X / 8, Y / 8, Z / 8], rounded up, numbers of bricks of 8^3 voxels: density and temperature
+            are then [N, 8, 8, 8], with 0 in brick 0. None: all voxels are stored.
+        cells: X, Y and Z of a volume with `places`.
+        solid: Obstacles for marches that light the smoke, see `wlm.view.smoke.Drawing.among`.
     """
 
     density: torch.Tensor
@@ -96,11 +101,14 @@ class DensityVolume:
     emission: float = 1.0
     kelvin: bool = False
     warnings: tuple[str, ...] = ()
+    places: torch.Tensor | None = None
+    cells: tuple[int, int, int] | None = None
+    solid: "Solid | None" = None
 
     @property
     def shape(self) -> tuple[int, int, int]:
         """Number of voxels along x, y and z."""
-        return tuple(self.density.shape)
+        return self.cells or tuple(self.density.shape)
 
     @property
     def device(self) -> torch.device:
@@ -120,13 +128,23 @@ class DensityVolume:
     @property
     def thickness(self) -> float:
         """Largest optical thickness along an axis: the extinction times the density, integrated through the box."""
-        along = max(float(self.density.sum(axis, dtype=torch.float32).max()) for axis in range(3))
-        return self.extinction * self.voxel * along
+        slabs = [[slab.sum(axis, dtype=torch.float32) for axis in range(3)] for slab in self.slabs(self.density)]
+        along = [sum(sums[0] for sums in slabs), *(torch.cat(sums) for sums in list(zip(*slabs, strict=True))[1:])]
+        return self.extinction * self.voxel * max(float(sums.max()) for sums in along)
+
+    def slabs(self, field: torch.Tensor) -> Iterator[torch.Tensor]:
+        """Yields the density or the temperature as tensors [x, Y, Z] whose x add up to X: one, or with bricks of 8."""
+        if self.places is None:
+            yield field
+            return
+        for x, places in enumerate(self.places):
+            slab = field[places.long()].permute(2, 0, 3, 1, 4).reshape(EDGE, *(EDGE * n for n in places.shape))
+            yield slab[: self.shape[0] - EDGE * x, : self.shape[1], : self.shape[2]]
 
     def arrays(self) -> tuple[wp.array, wp.array | None]:
-        """Returns density and temperature as Warp arrays that share the tensors' memory."""
-        hot = None if self.temperature is None else to_warp(self.temperature)
-        return to_warp(self.density), hot
+        """Returns density and temperature as Warp arrays of three axes that share the tensors' memory."""
+        hot = None if self.temperature is None else to_warp(self.temperature.flatten(0, -3))
+        return to_warp(self.density.flatten(0, -3)), hot
 
 
 def from_array(
@@ -332,9 +350,8 @@ def save_volume(
     suffix = _suffix(path)
     if volume.kelvin:
         raise WlmError(f"{path}: temperature: expected kelvins, found their light: load the volume with kelvin=False")
-    fields = {_DENSITY: volume.density}
-    if volume.temperature is not None:
-        fields[_TEMPERATURE] = volume.temperature
+    parts = zip((_DENSITY, _TEMPERATURE), (volume.density, volume.temperature), strict=True)
+    fields = {name: torch.cat(list(volume.slabs(part))) for name, part in parts if part is not None}
     if suffix != ".npz":
         grids = {name: values.cpu().numpy() for name, values in fields.items()}
         grids |= {} if velocity is None else {"velocity": velocity}

@@ -23,15 +23,15 @@ class FrameMaker(Whole):
 
     def __init__(self, device: str, method: Any, settings: Mapping[str, Any]) -> None:
         self._device = check_device(device)
-        self._predictor = None if method in _METHODS else SmokePredictor(method, self._device)
-        self._make = partial(self._predictor or _METHODS[method], **settings)
+        make = _METHODS[method] if method in _METHODS else SmokePredictor(method, self._device)
+        self._make = partial(make, **settings)
 
-    def run(self, job: tuple[str, DensityVolume, Camera, Looks | None]) -> tuple[SixWay, Looks | None, str | None]:
-        """Returns the lightmaps of a frame, in the host's memory, its looks, and a note of the network, or None."""
+    def run(self, job: tuple[str, DensityVolume, Camera, Looks | None]) -> tuple[SixWay, Looks | None]:
+        """Returns the lightmaps of a frame, in the host's memory, and its looks."""
         name, volume, camera, looks = job
         volume = moved(volume, self._device)
         try:
             six = with_surface(self._make(volume, camera), volume, looks)
         except WlmError as error:
             raise WlmError(f"{name}: {error}") from error
-        return moved(six, "cpu"), looks, None if self._predictor is None else self._predictor.note()
+        return moved(six, "cpu"), looks

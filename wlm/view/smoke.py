@@ -2,11 +2,13 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
 import warp as wp
 
+from wlm.fluid.volume import DensityVolume
 from wlm.interop import device_name, stream, to_warp
 from wlm.smoke.camera import DIRECTIONS, Camera, unit, weights
 from wlm.smoke.lightmaps import SixWay
@@ -15,6 +17,7 @@ from wlm.smoke.shading import AnyLight, Light, Ramp, checked_albedo, checked_col
 from wlm.smoke.transport.lighting import LitSmoke
 from wlm.smoke.transport.orders import ScatteredSmoke
 from wlm_kernels.smoke import picture as kernels
+from wlm_kernels.smoke.march import Solid
 
 # Share of an obstacle's colour that is always lit, so that its dark side differs from a black background.
 _AMBIENT = 0.2
@@ -23,9 +26,9 @@ _AMBIENT = 0.2
 class Drawing:
     """Draws pictures of smoke from one camera, under fixed lights, into buffers that are allocated once.
 
-    At a pixel an obstacle is in front of all of the smoke or behind all of it, depending on the depth of the smoke's
-    surface. Obstacles shadow this surface from directional lights. Point lights cast no shadows of obstacles and do
-    not light them.
+    With lightmaps, at a pixel an obstacle is in front of all of the smoke or behind all of it, depending on the depth
+    of the smoke's surface, and shadows this surface. Smoke that a march lights `among` the obstacles is shadowed in
+    its depth, also from point lights, and ends at them. Point lights do not light obstacles.
 
     `move` sets the positions of the obstacles. A call then only launches kernels, so on CUDA a graph can capture it.
 
@@ -33,7 +36,8 @@ class Drawing:
         image: float32 [H, W, 3], linear, the last picture.
         solid_light, solid_depth: Light [H, W, 3] of the obstacles and distance [H, W] along the ray, infinite where
             there is no obstacle.
-        visibility: Share of each of the L lights that obstacles let through to the smoke, [L, H, W]: 0 or 1.
+        visibility: Share of each of the L lights that obstacles let through to the surface of lightmaps, [L, H, W]: 0
+            or 1.
     """
 
     def __init__(
@@ -93,7 +97,7 @@ class Drawing:
 
     def move(self, time: float) -> None:
         """Moves the obstacles to their positions at a time in seconds."""
-        if self._obstacles:
+        if any(obstacle.eased.moves for obstacle in self._obstacles):
             with stream(self._device):
                 self._solids.mesh.points.assign(self._mesh_at(time)[0])
                 self._solids.mesh.refit()
@@ -111,6 +115,16 @@ class Drawing:
             out = to_warp(self.solid_light, wp.vec3), to_warp(self.solid_depth)
             kernels.light_solids(self._solids, self._as_lamps(), _AMBIENT, self._camera.in_world(), *out)
 
+    def among(self, volume: DensityVolume) -> DensityVolume:
+        """Draws the obstacles, and returns the volume with them for marches that light it; they follow `move`."""
+        if not self._obstacles:
+            return volume
+        self.draw_obstacles()
+        solid = Solid()
+        solid.mesh, solid.voxel, solid.stop = self._solids.mesh.id, volume.voxel, to_warp(self.solid_depth)
+        solid.corner = wp.vec3(*(np.asarray(volume.origin) - self._camera.position))
+        return replace(volume, solid=solid)
+
     def draw_shadows(self, surface: torch.Tensor) -> None:
         """Writes to `visibility` which lights reach the smoke's surface at distances [H, W]; 0: no surface, lit."""
         if self._obstacles:
@@ -122,7 +136,7 @@ class Drawing:
         """Draws a frame, and returns `image`.
 
         `smoke`, on the device, are lightmaps with transparency and, if there are obstacles, with depth; or smoke that
-        was lit by the drawing's lights. `ScatteredSmoke` already includes the albedo.
+        was lit by the drawing's lights, among its obstacles. `ScatteredSmoke` already includes the albedo.
         """
         six = smoke if isinstance(smoke, SixWay) else None
         seen = smoke.lit if isinstance(smoke, ScatteredSmoke) else smoke
@@ -135,9 +149,12 @@ class Drawing:
         with stream(self._device):
             solids = None
             if self._obstacles:
-                self.draw_obstacles()
-                self.draw_shadows(seen.depth)
-                solids = to_warp(seen.depth.contiguous()), to_warp(self.solid_light, wp.vec3), to_warp(self.solid_depth)
+                surface = self.solid_depth  # lit smoke ends there, so that no obstacle is before it
+                if six is not None:
+                    self.draw_obstacles()
+                    self.draw_shadows(seen.depth)
+                    surface = seen.depth.contiguous()
+                solids = to_warp(surface), to_warp(self.solid_light, wp.vec3), to_warp(self.solid_depth)
             glow = None
             if seen.emission is not None:
                 fire = glow_of(seen.emission.float(), self._ramp, None if six is not None else seen.thrown)
@@ -176,14 +193,16 @@ def picture(
     [H, W, 3], linear.
 
     `smoke` are lightmaps with their camera and transparency, and with their depth if there are obstacles; or smoke that
-    was lit before, by single or multiple scattering, which needs no lights. `time` is that of the obstacles, in
-    seconds.
+    was lit before, by single or multiple scattering, which needs no lights and cannot have obstacles. `time` is that of
+    the obstacles, in seconds.
     """
     lit = smoke.lit if isinstance(smoke, ScatteredSmoke) else smoke
     if lit.camera is None:
         raise ValueError("smoke: expected lightmaps or lit smoke with a camera, found none")
     options = {"albedo": albedo, "background": background, "ramp": ramp, "obstacles": obstacles, "rule": rule}
     device = device_name(lit.transparency.device if lit.transparency is not None else lit.lightmaps.device)
+    if obstacles and not isinstance(smoke, SixWay):
+        raise ValueError("obstacles: expected none with lit smoke, which a Drawing draws among obstacles")
     drawing = Drawing(lit.camera, lit.lights if lights is None else lights, **options, device=device)
     drawing.move(time)
     return drawing(smoke)

@@ -1,8 +1,4 @@
-"""Simulation, lighting and drawing of a scene frame by frame, in memory.
-
-On CUDA the lighting of a frame, from the march to the picture, is one CUDA graph. If a network makes the lightmaps,
-only the network has a graph.
-"""
+"""Simulation, lighting and drawing of a scene frame by frame, in memory."""
 
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -14,7 +10,6 @@ import warp as wp
 from wlm.fluid.volume import DensityVolume
 from wlm.smoke.camera import Camera
 from wlm.smoke.lightmaps import SixWay
-from wlm.smoke.march.launch import VolumeGraph
 from wlm.smoke.march.six_way import bake_coarse, coarse_march, guide
 from wlm.smoke.network.prediction import SmokePredictor
 from wlm.smoke.scene import Scene, make_camera
@@ -26,10 +21,9 @@ from wlm.view.pictures import to_bytes
 from wlm.view.smoke import Drawing
 from wlm_kernels.smoke.settings import March
 
-SIMULATION, DRAWING, GRAPH, BYTES = "simulation", "shadows and picture", "one graph", "bytes"
-"""Names of the stages of a frame, besides that of the lighting. A graph covers the lighting and the picture."""
+SIMULATION, DRAWING, BYTES = "simulation", "shadows and picture", "bytes"
+"""Names of the stages of a frame, besides that of the lighting."""
 
-_STAGED = 4  # frames whose stages are measured one by one before a graph replaces them
 _SURFACE = March(step=2.0, jitter=0.0)  # march to the surface on which shadows fall, if a network makes the lightmaps
 
 
@@ -47,9 +41,10 @@ class Lighting:
         return "lightmaps" if self.albedo is None else "light of all orders"
 
     def __call__(self, volume: DensityVolume, camera: Camera, lights: Sequence[AnyLight]) -> SixWay | ScatteredSmoke:
-        """Lights the smoke on its device. The result includes the depth of the smoke's surface."""
+        """Lights the smoke on its device. Lightmaps include the depth of the smoke's surface."""
         if self.albedo is not None:
             return scatter(volume, camera, lights, self.albedo)
+        volume = replace(volume, solid=None)  # obstacles shadow the lightmaps' surface
         if self.network is None:
             return bake_coarse(volume, camera, coarse_march(volume))
         six = self.network(volume, camera)
@@ -91,13 +86,8 @@ def run(
     camera = make_camera(scene.camera, scene.grid.origin, scene.grid.size)
     looks = scene.looks(1)
     lights = [light.light() for light in (looks if lighting.albedo is None else scene).lights]
-    parts = {"background": looks.background, "ramp": looks.ramp, "obstacles": looks.obstacles}
-    drawing = Drawing(camera, lights, albedo=looks.albedo, **parts, device=device)
-    graph = None
-    # A network waits for the device, which a graph cannot capture.
-    if lighting.network is None and device != "cpu":
-        # The frames before have loaded the kernels.
-        graph = VolumeGraph(lambda volume: drawing(lighting(volume, camera, lights)), device, warmup=1)
+    seen = {"background": looks.background, "ramp": looks.ramp, "obstacles": looks.obstacles}
+    drawing = Drawing(camera, lights, albedo=looks.albedo, **seen, device=device)
     smoke = False
     meter = Meter(progress, "run", scene.frames)
     for number in range(1, scene.frames + 1):
@@ -107,14 +97,10 @@ def run(
         volume = volume_of(scene, solver)
         clock.stop(SIMULATION)
         drawing.move(scene.time(number))
-        if graph is not None and number > _STAGED:
-            graph(volume)
-            clock.stop(GRAPH)
-        else:
-            made = lighting(volume, camera, lights)
-            clock.stop(lighting.stage)
-            drawing(made)
-            clock.stop(DRAWING)
+        made = lighting(drawing.among(volume), camera, lights)
+        clock.stop(lighting.stage)
+        drawing(made)
+        clock.stop(DRAWING)
         pixels = to_bytes(drawing.image, white)
         clock.stop(BYTES)
         smoke = smoke or bool(volume.density.any())

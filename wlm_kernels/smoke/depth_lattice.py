@@ -16,7 +16,17 @@ from typing import Any
 
 import warp as wp
 
-from wlm_kernels.smoke.march import OPTIONS, Medium, between_nodes, clip, for_smoke, sample, size_of
+from wlm_kernels.smoke.march import (
+    OPTIONS,
+    Medium,
+    Solid,
+    between_nodes,
+    box_of,
+    clip,
+    for_smoke,
+    sample,
+    way_to_solid,
+)
 from wlm_kernels.smoke.settings import March
 
 MOST_NODES = 2**28
@@ -26,6 +36,9 @@ voxels."""
 _MOST_MARCHING = 2**24  # largest number of nodes of a point light, each of which marches separately
 _AT_ONCE = wp.constant(8)  # nodes of a line that a thread sums at a time
 _LEAST_SPACING = 0.25  # voxels between nodes
+_DEEPEST = wp.constant(60000.0)  # largest optical depth between nodes, within the range of half floats
+_NEVER = wp.constant(1.0e30)
+_DARK = wp.constant(6.0)  # optical depth of an obstacle: a larger one would widen shadows between nodes
 _ROUNDING = 1e-6  # relative excess of a part over the step that is tolerated, so that rounding adds no part
 
 _Several = wp.types.vector(length=int(_AT_ONCE), dtype=float)
@@ -68,6 +81,16 @@ def _node(lattice: Lattice, i: int, j: int, k: int) -> wp.vec3:
 
 
 @wp.func
+def _lit_way(solid: Solid, end: wp.vec4i, lattice: Lattice, toward: wp.vec3) -> float:
+    """Computes how far from the end of a line its nodes are lit by a light beyond the end; negative: nowhere."""
+    p = _node(lattice, end[1], end[2], end[3])
+    if way_to_solid(solid, p, toward) < _NEVER:
+        return -1.0
+    # A gap more, since light is interpolated between nodes: else the lit side of an obstacle would be dark.
+    return way_to_solid(solid, p, -toward) + wp.length(wp.cw_mul(lattice.axes * toward, lattice.gap))
+
+
+@wp.func
 def _on_line(pair: int, line: int, n: int, k: int) -> wp.vec4i:
     """Returns the indices of the n-th node of a line along the first axis (pair 0) or along the second one."""
     return wp.vec4i(pair, wp.where(pair == 0, n, line), wp.where(pair == 0, line, n), k)
@@ -76,9 +99,10 @@ def _on_line(pair: int, line: int, n: int, k: int) -> wp.vec4i:
 @wp.kernel(module="unique", module_options=OPTIONS)
 def _add_up(
     # in:
-    gaps: wp.array4d[float],
+    gaps: wp.array4d[wp.float16],
+    lattice: Lattice,
+    solid: Solid,
     # out:
-    ahead: wp.array4d[float],
     nodes: wp.array4d[wp.vec2],
 ):
     """Sums optical depths from each node of a line to both of its ends; the light is beyond the last node."""
@@ -86,34 +110,35 @@ def _add_up(
     last = wp.where(pair == 0, nodes.shape[1], nodes.shape[2]) - 1
     if line >= wp.where(pair == 0, nodes.shape[2], nodes.shape[1]):
         return
-    # Several nodes at a time, since loads wait for earlier stores. Both depths of a node are stored at once, so that
-    # neighbouring threads write whole stretches of memory.
-    total = float(0.0)
-    for begin in range(0, last, _AT_ONCE):
+    # Nodes farther from the last node, and from the first one, are in the shadow of obstacles.
+    lit = float(_NEVER)
+    opposite = float(_NEVER)
+    if solid.mesh != wp.uint64(0):
+        gap = wp.where(pair == 0, lattice.gap[0], lattice.gap[1])
+        lit = _lit_way(solid, _on_line(pair, line, last, k), lattice, axis(lattice, pair)) / gap
+        opposite = _lit_way(solid, _on_line(pair, line, 0, k), lattice, -axis(lattice, pair)) / gap
+    # In double precision, since the depth ahead is a difference. Several nodes at a time, since loads wait for earlier
+    # stores.
+    ahead = wp.float64(0.0)
+    for n in range(last):
+        q = _on_line(pair, line, n, k)
+        ahead += wp.float64(gaps[q[0], q[1], q[2], q[3]])
+    behind = wp.float64(0.0)
+    for begin in range(0, last + 1, _AT_ONCE):
         several = _Several()
-        for m in range(_AT_ONCE):
-            q = _on_line(pair, line, wp.max(last - 1 - begin - m, 0), k)
-            several[m] = gaps[q[0], q[1], q[2], q[3]]
-        for m in range(_AT_ONCE):
-            if begin + m < last:
-                total += several[m]
-                q = _on_line(pair, line, last - 1 - begin - m, k)
-                ahead[q[0], q[1], q[2], q[3]] = total
-    behind = float(0.0)
-    for begin in range(0, last, _AT_ONCE):
-        several = _Several()
-        to_end = _Several()
-        for m in range(_AT_ONCE):
-            q = _on_line(pair, line, wp.min(begin + m, last - 1), k)
-            several[m] = gaps[q[0], q[1], q[2], q[3]]
-            to_end[m] = ahead[q[0], q[1], q[2], q[3]]
         for m in range(_AT_ONCE):
             if begin + m < last:
                 q = _on_line(pair, line, begin + m, k)
-                nodes[q[0], q[1], q[2], q[3]] = wp.vec2(to_end[m], behind)
-                behind += several[m]
-    q = _on_line(pair, line, last, k)
-    nodes[q[0], q[1], q[2], q[3]] = wp.vec2(0.0, behind)
+                several[m] = float(gaps[q[0], q[1], q[2], q[3]])
+        for m in range(_AT_ONCE):
+            n = begin + m
+            if n <= last:
+                q = _on_line(pair, line, n, k)
+                a = float(ahead) + wp.where(float(last - n) > lit, _DARK, 0.0)
+                b = float(behind) + wp.where(float(n) > opposite, _DARK, 0.0)
+                nodes[q[0], q[1], q[2], q[3]] = wp.vec2(a, b)
+                ahead -= wp.float64(several[m])
+                behind += wp.float64(several[m])
 
 
 @for_smoke
@@ -125,12 +150,12 @@ def _measure(smoke_type: Any, pairs: int) -> wp.Kernel:
         lattice: Lattice,
         parts: wp.vec2i,
         # out:
-        gaps: wp.array4d[float],
+        gaps: wp.array4d[wp.float16],
     ):
         """Computes the optical depth from a node to the next node along the axis of each pair of opposite lights."""
         i, j, k = wp.tid()
         begin = _node(lattice, i, j, k)
-        size = size_of(smoke.density)
+        size = box_of(smoke)
         for pair in range(wp.static(pairs)):
             tau = float(0.0)
             if wp.where(pair == 0, i, j) < wp.where(pair == 0, gaps.shape[1], gaps.shape[2]) - 1:
@@ -142,7 +167,7 @@ def _measure(smoke_type: Any, pairs: int) -> wp.Kernel:
                     low = wp.min(p) >= -0.5
                     if low and p[0] <= size[0] + 0.5 and p[1] <= size[1] + 0.5 and p[2] <= size[2] + 0.5:
                         tau += d * sample(smoke, p)
-            gaps[pair, i, j, k] = smoke.extinction * tau
+            gaps[pair, i, j, k] = wp.float16(wp.min(smoke.extinction * tau, _DEEPEST))
 
     return kernel
 
@@ -162,7 +187,7 @@ def _reach(smoke_type: Any) -> wp.Kernel:
         p = _node(lattice, i, j, k)
         away = wp.length(lattice.place - p)
         toward = wp.normalize(lattice.place - p)
-        span = clip(size_of(smoke.density), p, toward)
+        span = clip(box_of(smoke), p, toward)
         first = wp.max(span[0], 0.0)
         last = wp.min(span[1], away)
         tau = float(0.0)
@@ -171,7 +196,13 @@ def _reach(smoke_type: Any) -> wp.Kernel:
             d = (last - first) / float(count)
             for n in range(count):
                 tau += d * sample(smoke, p + (first + (float(n) + 0.5) * d) * toward)
-        nodes[i, j, k] = wp.vec2(smoke.extinction * tau, 0.0)
+        tau = smoke.extinction * tau
+        if smoke.solid.mesh != wp.uint64(0):
+            # As far from the lit side of an obstacle as a gap, light still falls: see `_lit_way`.
+            skipped = wp.max(lattice.gap)
+            if skipped + way_to_solid(smoke.solid, p + skipped * toward, toward) < away:
+                tau += _DARK
+        nodes[i, j, k] = wp.vec2(tau, 0.0)
 
     return kernel
 
@@ -209,44 +240,37 @@ def make_lattice(
     return lattice, tuple(n + 1 for n in gaps)
 
 
-def add_up(medium: Medium, lattice: Lattice, counts: Sequence[int], pairs: int, light_step: float) -> wp.array:
+def add_up(medium: Medium, lattice: Lattice, counts: Sequence[int], pairs: int, step: float) -> wp.array:
     """Computes the optical depths from the nodes of a lattice of `make_lattice` to one or two `pairs` of opposite
     lights at infinity: at both ends of the lattice's first axis, and of its second.
 
-    `light_step` is the longest step between two nodes, in voxels. Returns vec2 [pairs, X, Y, Z] for each node: depths
+    `step` is the longest step between two nodes, in voxels. Returns vec2 [pairs, X, Y, Z] for each node: depths
     to the light at the axis's end and to the light at its start.
     """
-    parts = wp.vec2i(*(parts_of(lattice.gap[n], light_step) for n in range(2)))
-    gaps, ahead = (medium.buffer((pairs, *counts), float) for _ in range(2))
-    nodes = medium.buffer((pairs, *counts), wp.vec2)
+    parts = wp.vec2i(*(parts_of(lattice.gap[n], step) for n in range(2)))
+    gaps, nodes = (medium.buffer((pairs, *counts), dtype) for dtype in (wp.float16, wp.vec2))
     _measure(medium, tuple(counts), [lattice, parts], [gaps], pairs)
     lines = max(counts[:2]) if pairs == 2 else counts[1]
-    wp.launch(_add_up, (pairs, lines, counts[2]), [gaps], [ahead, nodes], device=medium.device)
+    inputs = [gaps, lattice, medium.solid or Solid()]
+    wp.launch(_add_up, (pairs, lines, counts[2]), inputs, [nodes], device=medium.device)
     return nodes
-
-
-def spacing_of(march: March) -> tuple[float, float]:
-    """Returns the largest distance between nodes of the lattice, and the longest step between them, in voxels."""
-    spacing = march.step if march.spacing is None else march.spacing
-    return spacing, spacing if march.light_step is None else march.light_step
 
 
 def reach(medium: Medium, place: Sequence[float], radius: float | None, march: March) -> tuple[Lattice, wp.array]:
     """Computes optical depths from the smoke to a light at `place`: the direction to a light at infinity, of length 1,
     or the position of a point light in voxels with a radius in voxels, within which its irradiance is constant.
 
-    Of `march` only spacing and light_step are used; the lattice of a point light has at most 2^24 nodes. Returns a
+    Of `march` only the spacing is used, or the step; the lattice of a point light has at most 2^24 nodes. Returns a
     lattice, and vec2 [X, Y, Z] at its nodes: depths to the light and to the opposite light, for a point light 0.
     """
-    spacing, step = spacing_of(march)
-    shape = medium.density.shape
+    spacing, shape = march.spacing or march.step, medium.shape
     if radius is None:
         lattice, counts = make_lattice(shape, _axes(place), spacing)
-        return lattice, add_up(medium, lattice, counts, 1, step).reshape(counts)
+        return lattice, add_up(medium, lattice, counts, 1, spacing).reshape(counts)
     lattice, counts = make_lattice(shape, ((1, 0, 0), (0, 1, 0), (0, 0, 1)), spacing, most=_MOST_MARCHING)
     lattice.place, lattice.point, lattice.radius = wp.vec3(*place), 1, float(radius)
     nodes = medium.buffer(counts, wp.vec2)
-    _reach(medium, counts, [lattice, step], [nodes])
+    _reach(medium, counts, [lattice, spacing], [nodes])
     return lattice, nodes
 
 

@@ -23,13 +23,14 @@ from wlm_kernels.smoke.march import (
     absorbed,
     begin,
     between_nodes,
+    box_of,
     for_smoke,
     look,
     parameters,
     pass_step,
     sample,
-    size_of,
     steps_along,
+    way_to_solid,
 )
 from wlm_kernels.smoke.settings import March
 
@@ -283,9 +284,11 @@ def _shoot(smoke_type: Any) -> wp.Kernel:
         height = 1.0 - (2.0 * float(n) + 1.0) / float(_RAYS)
         around = float(n) * _TURN
         across = wp.sqrt(1.0 - height * height)
-        r = steps_along(
-            size_of(smoke.density), place, wp.vec3(across * wp.cos(around), height, across * wp.sin(around)), step
-        )
+        way = wp.vec3(across * wp.cos(around), height, across * wp.sin(around))
+        r = steps_along(box_of(smoke), place, way, step)
+        if smoke.solid.mesh != wp.uint64(0) and r.count > 0:
+            ahead = (way_to_solid(smoke.solid, place, way) - r.first) / r.length
+            r.count = int(wp.clamp(ahead, 0.0, float(r.count)))
         r.offset = 0.5
         left = float(power)
         pending = float(0.0)

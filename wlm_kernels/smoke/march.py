@@ -34,17 +34,29 @@ BRICK = 8
 OPTIONS = {"enable_backward": False}
 """Options of every module of smoke kernels."""
 
-_NEVER = 1.0e30
+_NEVER = wp.constant(1.0e30)
 _SEEDS = 2**32
 _PATTERNS = wp.constant(64)  # number of patterns of the gradient noise, a power of 2
 
 
+@wp.struct
+class Solid:
+    """Obstacles in smoke: a mesh of the world's unit in which the smoke's voxel (0, 0, 0) has its corner at `corner`,
+    the edge of a voxel in this unit, and the distance at which the ray of each pixel of the camera ends, [H, W] in this
+    unit as in `View`. Without obstacles the mesh is 0, and without a camera the distances are empty."""
+
+    mesh: wp.uint64
+    corner: wp.vec3
+    voxel: float
+    stop: wp.array2d[float]
+
+
 @functools.cache
-def smoke_struct(dtype: Any, in_bricks: bool) -> Any:
+def smoke_struct(dtype: Any, in_bricks: bool, stored: bool = False) -> Any:
     """Builds (once) the struct in which kernels take smoke with densities of `wp.float32` or `wp.float16`.
 
-    `in_bricks` tells whether it is known which bricks of 8^3 voxels contain smoke. If not, `bricks` is a meaningless
-    integer, so that marches contain no test of bricks.
+    `in_bricks` tells whether it is known which bricks of 8^3 voxels contain smoke, and `stored` whether only these are
+    stored. If not, `bricks` or `places` is a meaningless integer, so that marches contain no test of bricks.
     """
 
     @wp.struct
@@ -52,8 +64,11 @@ def smoke_struct(dtype: Any, in_bricks: bool) -> Any:
         density: wp.array3d[dtype]
         temperature: wp.array3d[dtype]
         bricks: wp.array3d[wp.uint8] if in_bricks else int
+        places: wp.array3d[int] if stored else int
+        cells: wp.vec3i
         extinction: float
         emission: float
+        solid: Solid
 
     return Smoke
 
@@ -64,7 +79,10 @@ class Medium:
     array like the density's, None for smoke without light, and light emitted per voxel at temperature 1.
 
     `empty` allocates buffers on the density's device; None: Warp's own allocator. `bricks` tells which bricks of 8^3
-    voxels contain smoke, a result of `occupied`; None: marches sample every voxel.
+    voxels contain smoke, a result of `occupied`; None: marches sample every voxel. With `places`, int [X / 8, Y / 8,
+    Z / 8], the numbers of bricks in `density` and `temperature`, these are [8 N, 8, 8], with 0 in brick 0, and `bricks`
+    must be given; None: all voxels are stored. `cells` are X, Y and Z; None: the density's. `solid` are obstacles in
+    the way of light and camera; None: there are none.
     """
 
     density: wp.array
@@ -73,6 +91,9 @@ class Medium:
     emission: float = 0.0
     empty: Empty | None = None
     bricks: wp.array | None = None
+    places: wp.array | None = None
+    cells: tuple[int, ...] | None = None
+    solid: "Solid | None" = None
 
     @property
     def device(self) -> wp.Device:
@@ -86,23 +107,33 @@ class Medium:
 
     def in_bricks(self) -> "Medium":
         """Returns the same smoke with `bricks`, so that marches skip empty bricks, which changes no result."""
-        return replace(self, bricks=occupied(self))
+        return replace(self, bricks=occupied(self)) if self.bricks is None else self
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Number of voxels along x, y and z."""
+        return self.cells or self.density.shape
 
     @property
     def smoke_type(self) -> Any:
         """Type of the struct `smoke`: kernels are compiled for each such type."""
-        return smoke_struct(self.density.dtype, self.bricks is not None)
+        return smoke_struct(self.density.dtype, self.bricks is not None, self.places is not None)
 
     @functools.cached_property
     def smoke(self) -> Any:
         """The struct in which kernels take the smoke; without a temperature the density takes its place, emission 0."""
         smoke = self.smoke_type()
         smoke.density, smoke.extinction = self.density, float(self.extinction)
+        smoke.cells = wp.vec3i(*self.shape)
         smoke.temperature, smoke.emission = self.density, 0.0
         if self.temperature is not None:
             smoke.temperature, smoke.emission = self.temperature, float(self.emission)
         if self.bricks is not None:
             smoke.bricks = self.bricks
+        if self.places is not None:
+            smoke.places = self.places
+        if self.solid is not None:
+            smoke.solid = self.solid
         return smoke
 
 
@@ -252,8 +283,23 @@ def point_on(r: Ray, n: int, offset: float) -> wp.vec3:
 
 
 @wp.func
-def density_at(density: wp.array3d[Any], p: wp.vec3) -> float:
-    """Interpolates density trilinearly, with 0 outside the grid."""
+def box_of(smoke: Any) -> wp.vec3:
+    return wp.vec3(float(smoke.cells[0]), float(smoke.cells[1]), float(smoke.cells[2]))
+
+
+@wp.func
+def _voxel(field: wp.array3d[Any], places: int, i: int, j: int, k: int) -> float:
+    return float(field[i, j, k])
+
+
+@wp.func
+def _voxel(field: wp.array3d[Any], places: wp.array3d[int], i: int, j: int, k: int) -> float:
+    return float(field[BRICK * places[i // BRICK, j // BRICK, k // BRICK] + i % BRICK, j % BRICK, k % BRICK])
+
+
+@wp.func
+def density_at(field: wp.array3d[Any], smoke: Any, p: wp.vec3) -> float:
+    """Interpolates the density or the temperature of smoke trilinearly, with 0 outside the grid."""
     x = p[0] - 0.5
     y = p[1] - 0.5
     z = p[2] - 0.5
@@ -264,9 +310,9 @@ def density_at(density: wp.array3d[Any], p: wp.vec3) -> float:
     fy = y - float(j)
     fz = z - float(k)
     # Voxels outside the grid have weight 0 and a clamped index.
-    nx = density.shape[0]
-    ny = density.shape[1]
-    nz = density.shape[2]
+    nx = smoke.cells[0]
+    ny = smoke.cells[1]
+    nz = smoke.cells[2]
     wx0 = wp.where(i >= 0 and i < nx, 1.0 - fx, 0.0)
     wx1 = wp.where(i >= -1 and i < nx - 1, fx, 0.0)
     wy0 = wp.where(j >= 0 and j < ny, 1.0 - fy, 0.0)
@@ -279,32 +325,32 @@ def density_at(density: wp.array3d[Any], p: wp.vec3) -> float:
     j1 = wp.clamp(j + 1, 0, ny - 1)
     k0 = wp.clamp(k, 0, nz - 1)
     k1 = wp.clamp(k + 1, 0, nz - 1)
-    a = wy0 * (wz0 * float(density[i0, j0, k0]) + wz1 * float(density[i0, j0, k1]))
-    a += wy1 * (wz0 * float(density[i0, j1, k0]) + wz1 * float(density[i0, j1, k1]))
-    b = wy0 * (wz0 * float(density[i1, j0, k0]) + wz1 * float(density[i1, j0, k1]))
-    b += wy1 * (wz0 * float(density[i1, j1, k0]) + wz1 * float(density[i1, j1, k1]))
+    a = wy0 * (wz0 * _voxel(field, smoke.places, i0, j0, k0) + wz1 * _voxel(field, smoke.places, i0, j0, k1))
+    a += wy1 * (wz0 * _voxel(field, smoke.places, i0, j1, k0) + wz1 * _voxel(field, smoke.places, i0, j1, k1))
+    b = wy0 * (wz0 * _voxel(field, smoke.places, i1, j0, k0) + wz1 * _voxel(field, smoke.places, i1, j0, k1))
+    b += wy1 * (wz0 * _voxel(field, smoke.places, i1, j1, k0) + wz1 * _voxel(field, smoke.places, i1, j1, k1))
     return wx0 * a + wx1 * b
 
 
 @wp.func
-def _in_brick(density: wp.array3d[Any], bricks: wp.array3d[wp.uint8], p: wp.vec3) -> float:
+def _has_smoke(bricks: wp.array3d[wp.uint8], p: wp.vec3) -> bool:
     i = wp.clamp(int(p[0]) // BRICK, 0, bricks.shape[0] - 1)
     j = wp.clamp(int(p[1]) // BRICK, 0, bricks.shape[1] - 1)
     k = wp.clamp(int(p[2]) // BRICK, 0, bricks.shape[2] - 1)
-    if bricks[i, j, k] == wp.uint8(0):
-        return 0.0
-    return density_at(density, p)
+    return bricks[i, j, k] != wp.uint8(0)
 
 
 @wp.func
-def _in_brick(density: wp.array3d[Any], bricks: int, p: wp.vec3) -> float:
-    return density_at(density, p)
+def _has_smoke(bricks: int, p: wp.vec3) -> bool:
+    return True
 
 
 @wp.func
 def sample(smoke: Any, p: wp.vec3) -> float:
     """Interpolates density at p, at most half a voxel outside the grid; returns 0 at once in a brick known as empty."""
-    return _in_brick(smoke.density, smoke.bricks, p)
+    if _has_smoke(smoke.bricks, p):
+        return density_at(smoke.density, smoke, p)
+    return 0.0
 
 
 @wp.func
@@ -363,7 +409,11 @@ def noise(row: int, column: int, seed: int) -> float:
 def begin(view: View, row: int, column: int, smoke: Any, step: float, offset: float) -> Ray:
     """Makes the ray of a pixel, before its first step; it samples each step at `offset` of its length, 0 to 1."""
     r = ray(view, row, column)
-    r = steps_along(size_of(smoke.density), r.origin, r.direction, step)
+    r = steps_along(box_of(smoke), r.origin, r.direction, step)
+    if smoke.solid.stop.shape[0] > 0:
+        left = wp.min(smoke.solid.stop[row, column] / view.voxel - view.moved - r.first, float(r.count) * r.length)
+        r.count = int(wp.ceil(wp.max(left, 0.0) / step))
+        r.length = left / float(wp.max(r.count, 1))
     r.offset = offset
     r.t = 1.0
     return r
@@ -410,13 +460,20 @@ def surface(depth: float, r: Ray, view: View, threshold: float) -> float:
 @wp.func
 def emitted(r: Ray, smoke: Any) -> float:
     """Computes the light that a step emits and that reaches the camera; air without smoke emits too where it is hot."""
-    return r.t * mean_transparency(r.x) * smoke.emission * r.length * density_at(smoke.temperature, r.place)
+    return r.t * mean_transparency(r.x) * smoke.emission * r.length * density_at(smoke.temperature, smoke, r.place)
+
+
+@wp.func
+def way_to_solid(solid: Solid, p: wp.vec3, toward: wp.vec3) -> float:
+    """Computes the distance in voxels from p to the first obstacle in a direction; 1e30 if there is none."""
+    hit = wp.mesh_query_ray(solid.mesh, solid.corner + solid.voxel * p, toward, _NEVER)
+    return wp.where(hit.result, hit.t / solid.voxel, _NEVER)
 
 
 @wp.func
 def optical_depth(smoke: Any, p: wp.vec3, toward: wp.vec3, step: float) -> float:
     """Computes the optical depth (eq. 3) from p out of the grid, with samples in the middles of steps up to `step`."""
-    r = steps_along(size_of(smoke.density), p, toward, step)
+    r = steps_along(box_of(smoke), p, toward, step)
     tau = float(0.0)
     for n in range(r.count):
         tau += sample(smoke, point_on(r, n, 0.5))

@@ -26,6 +26,7 @@ from wlm_kernels.smoke.march import (
     Medium,
     View,
     absorbed,
+    box_of,
     clip,
     density_at,
     for_smoke,
@@ -35,7 +36,6 @@ from wlm_kernels.smoke.march import (
     ray,
     require_orthographic,
     sample,
-    size_of,
 )
 from wlm_kernels.smoke.settings import March
 
@@ -108,7 +108,7 @@ def _plan(smoke_type: Any) -> wp.Kernel:
         optical depths of rays."""
         row, col = wp.tid()
         r = ray(view, row, col)
-        span = clip(size_of(smoke.density), r.origin, r.direction)
+        span = clip(box_of(smoke), r.origin, r.direction)
         h = sections.length
         tau = float(0.0)
         middle = _thickness(smoke, span, r.origin, r.direction, sections.start - 0.5 * h, h)
@@ -173,7 +173,7 @@ def _sweep(smoke_type: Any) -> wp.Kernel:
             ahead = -view.up
             count = view.height
         # Pixel k is at distance `origin` + k pitch; there are whole steps between pixels.
-        span = clip(size_of(smoke.density), base, ahead)
+        span = clip(box_of(smoke), base, ahead)
         h = view.pitch / float(parts)
         origin = (0.5 - 0.5 * float(count)) * view.pitch
         begin = origin
@@ -235,7 +235,7 @@ def _gather(smoke_type: Any) -> wp.Kernel:
     ):
         row, col = wp.tid()
         r = ray(view, row, col)
-        span = clip(size_of(smoke.density), r.origin, r.direction)
+        span = clip(box_of(smoke), r.origin, r.direction)
         tau = passed[row, col]
         light = wp.vec4()
         hot = float(0.0)
@@ -257,7 +257,8 @@ def _gather(smoke_type: Any) -> wp.Kernel:
                     )
                     light += t * absorbed(x) * phase(march.g, 0.0) * left
                 if smoke.emission > 0.0:
-                    hot += smoke.emission * density_at(smoke.temperature, p) * plane[1] * t * mean_transparency(x)
+                    glow = smoke.emission * density_at(smoke.temperature, smoke, p)
+                    hot += glow * plane[1] * t * mean_transparency(x)
                 tau += x
         passed[row, col] = tau
         for c in range(4):
@@ -297,7 +298,7 @@ def six_way(medium: Medium, view: View, march: March, out: wp.array) -> None:
     medium = medium.in_bricks()
     height, width = view.height, view.width
     out.zero_()
-    near, far = _extent(medium.density.shape, view.origin, view.forward)
+    near, far = _extent(medium.shape, view.origin, view.forward)
     start = max(near, 0.0)
     passed, behind = (medium.buffer((height, width), float) for _ in range(2))
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import warp as wp
 
-from wlm_kernels.smoke.depth_lattice import Lattice, add_up, axis, depths_at, make_lattice, reach, spacing_of
+from wlm_kernels.smoke.depth_lattice import Lattice, add_up, axis, depths_at, make_lattice, reach
 from wlm_kernels.smoke.march import (
     BRICK,
     OPTIONS,
@@ -22,6 +22,7 @@ from wlm_kernels.smoke.march import (
     begin,
     begin_jittered,
     between_nodes,
+    box_of,
     emitted,
     for_smoke,
     in_tiles,
@@ -32,7 +33,6 @@ from wlm_kernels.smoke.march import (
     phase,
     pixel_of,
     require_orthographic,
-    size_of,
     surface,
 )
 from wlm_kernels.smoke.settings import March
@@ -110,8 +110,8 @@ def guide(medium: Medium, view: View, march: March, out: wp.array, *, shared: bo
     Args:
         medium: The smoke, of albedo 1.
         view: The camera, [H, W] pixels.
-        march: Settings; its step is also the step towards the lights. Its cutoff causes an error of at most the cutoff
-            in transparency, and 2.5 times the cutoff in light (for g = 0).
+        march: Settings; its step, at least a voxel, is also the step towards the lights. Its cutoff causes an error of
+            at most the cutoff in transparency, and 2.5 times the cutoff in light (for g = 0).
         out: float [3, H, W], written: sum of the light scattered under the three lights, each of irradiance 4 pi;
             transparency; distance from the camera, in the unit of `View.voxel`, to the first sample denser than the
             threshold, 0 if there is none.
@@ -120,9 +120,7 @@ def guide(medium: Medium, view: View, march: March, out: wp.array, *, shared: bo
     """
     lattice, nodes = Lattice(), medium.buffer((0, 0, 0), wp.vec2)
     if shared:
-        lattice, nodes = reach(
-            medium, view.up, None, replace(march, spacing=max(march.step, 1.0), light_step=march.step)
-        )
+        lattice, nodes = reach(medium, view.up, None, replace(march, spacing=max(march.step, 1.0)))
     _guide(medium, in_tiles(*out.shape[1:]), [nodes, view, lattice, parameters(march)], [out], shared)
 
 
@@ -219,9 +217,9 @@ def coarse_six_way(medium: Medium, view: View, march: March, out: wp.array) -> N
     require_orthographic(view, "six-way lightmaps")
     if march.step < BRICK:
         medium = medium.in_bricks()
-    spacing, light_step = spacing_of(march)
-    lattice, counts = make_lattice(medium.density.shape, (view.right, view.up, view.forward), spacing, view.origin)
-    nodes = add_up(medium, lattice, counts, 2, light_step)
+    spacing = march.spacing or march.step
+    lattice, counts = make_lattice(medium.shape, (view.right, view.up, view.forward), spacing, view.origin)
+    nodes = add_up(medium, lattice, counts, 2, spacing)
     hot = medium.temperature is not None
     _coarse(medium, in_tiles(*out.shape[1:]), [nodes, view, lattice, parameters(march)], [out], hot)
 
@@ -342,7 +340,7 @@ def _motion(smoke_type: Any) -> wp.Kernel:
         if row >= view.height or column >= view.width:
             return
         r = begin(view, row, column, smoke, march.step, 0.5)
-        size = size_of(smoke.density)
+        size = box_of(smoke)
         cells = wp.vec3(float(velocity.shape[0]), float(velocity.shape[1]), float(velocity.shape[2]))
         share = wp.cw_div(cells, size)
         border = wp.vec3(_BORDER, _BORDER, _BORDER)

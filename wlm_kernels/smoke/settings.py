@@ -13,8 +13,7 @@ class March:
     Attributes:
         step: Longest step along a ray.
         spacing: Largest distance between nodes, the points at which optical depths to the lights are computed; None:
-            `step`. Only used by marches that compute them at nodes, as is `light_step`.
-        light_step: Longest step of the march from node to node; None: `spacing`.
+            `step`. Only used by marches that compute them at nodes.
         jitter: Range of the random shift of a pixel's samples, in steps: 0 (samples in the middles of steps) to 1.
         seed: Seed of the jitter, any integer.
         threshold: Extinction per voxel above which smoke has a surface; the depth is the distance to it.
@@ -27,7 +26,6 @@ class March:
 
     step: float = 10.0
     spacing: float | None = None
-    light_step: float | None = None
     jitter: float = 1.0
     seed: int = 0
     threshold: float = 0.01
@@ -35,7 +33,7 @@ class March:
     cutoff: float = 1e-4
 
     def __post_init__(self) -> None:
-        for name in ("step", "spacing", "light_step"):
+        for name in ("step", "spacing"):
             value = getattr(self, name)
             if value is not None and not LEAST_STEP <= value < float("inf"):
                 raise ValueError(f"{name}: expected a finite length of at least {LEAST_STEP} voxels, got {value}")

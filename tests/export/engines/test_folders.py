@@ -155,7 +155,8 @@ def as_glsl(text):
     text = re.sub(r"^(uniform [^:;]*?) : [^;=]*?( =[^;]*)?;", r"\1\2;", text, flags=re.MULTILINE)
     text = re.sub(r"^varying ", "", text, flags=re.MULTILINE)
     names = "vec3 ALBEDO, EMISSION, LIGHT, LIGHT_COLOR, DIFFUSE_LIGHT; float ALPHA, ATTENUATION; vec2 UV, UV2;\n"
-    names += "vec4 COLOR; mat4 MODEL_MATRIX, VIEW_MATRIX, MODELVIEW_MATRIX; mat3 MODELVIEW_NORMAL_MATRIX;\n"
+    names += "const bool OUTPUT_IS_SRGB = false; vec4 COLOR;\n"
+    names += "mat4 MODEL_MATRIX, VIEW_MATRIX, MODELVIEW_MATRIX; mat3 MODELVIEW_NORMAL_MATRIX;\n"
     return names + text.replace("void light()", "void light_of()")
 
 

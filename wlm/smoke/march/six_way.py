@@ -139,7 +139,7 @@ def guide(volume: DensityVolume, camera: Camera, march: March = March(), *, shar
     Args:
         volume: The smoke.
         camera: Orthographic or in perspective. If it is inside the smoke, the light from the front starts there.
-        march: Settings without `spacing` and `light_step`, which equal the step.
+        march: Settings without `spacing`, which is the step.
         shared: Whether pixels share the marches to the lights, on a lattice with a node per step, which is much faster;
             light is then interpolated between nodes.
 
@@ -147,11 +147,10 @@ def guide(volume: DensityVolume, camera: Camera, march: March = March(), *, shar
         The maps, on the smoke's device.
 
     Raises:
-        ValueError: The march has a spacing or a light_step.
+        ValueError: The march has a spacing.
     """
-    for name in ("spacing", "light_step"):
-        if getattr(march, name) is not None:
-            raise ValueError(f"{name}: expected None, since a guiding map uses the step, got {getattr(march, name)}")
+    if march.spacing is not None:
+        raise ValueError(f"spacing: expected None, since a guiding map uses the step, got {march.spacing}")
     return Guide(run(marches.guide, volume, camera, (3,), march, shared=shared), camera)
 
 

@@ -91,19 +91,18 @@ class CoarseSmoke:
 
     def __init__(self, volume: DensityVolume, cells: int = CELLS) -> None:
         """Averages the smoke over `cells` cells along its longest edge; to be called inside `wlm.interop.stream`."""
-        self.medium = medium_of(volume)
+        self.medium, self._volume = medium_of(volume), volume
         longest = max(volume.shape)
         self._counts = [max(1, round(cells * n / longest)) for n in volume.shape]
         self.edges = tuple(n / count for n, count in zip(volume.shape, self._counts, strict=True))
         self.extinction = self.mean(volume.density).mul_(volume.extinction * volume.voxel)
 
     def mean(self, voxels: torch.Tensor) -> torch.Tensor:
-        """Returns the mean of a voxel grid over each coarse cell, float32 [X, Y, Z]."""
-        mean = voxels.float()
-        for count in self._counts:
-            # Each product moves its axis to the end, so that after three the order is restored.
-            mean = torch.tensordot(mean, _shares(mean.shape[0], count, mean.device), ([0], [0]))
-        return mean.contiguous()
+        """Returns the mean of the volume's density or temperature over each coarse cell, float32 [X, Y, Z]."""
+        parts = zip(self._volume.shape, self._counts, strict=True)
+        x, y, z = (_shares(*part, voxels.device) for part in parts)
+        planes = [torch.tensordot(slab.float() @ z, y, ([1], [0])) for slab in self._volume.slabs(voxels)]
+        return torch.tensordot(torch.cat(planes), x, ([0], [0])).permute(2, 1, 0).contiguous()
 
     def spread(self, source: torch.Tensor, albedos: Sequence[float]) -> torch.Tensor:
         """Computes the fluence, the light from all directions, of light that was scattered at least once, by diffusion.

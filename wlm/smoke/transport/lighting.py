@@ -124,7 +124,7 @@ def light_smoke(
     """Computes light that was scattered once, by a separate march for each light.
 
     Args:
-        volume: The smoke.
+        volume: The smoke; its `solid` shadows it, and camera rays end there.
         camera: Any camera, outside the smoke or inside.
         lights: Any number of lights.
         march: Settings of the marches; None: those of `fine_march`.

@@ -245,6 +245,8 @@ def scatter(
 ) -> ScatteredSmoke:
     """Predicts light of all orders of scattering from marches and diffusion.
 
+    Light that was scattered once passes through the obstacles of the volume.
+
     Args:
         volume: The smoke.
         camera: Any camera.

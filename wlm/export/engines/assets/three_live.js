@@ -9,7 +9,7 @@
 //     smoke.update(camera, {size: 256});  // each frame, before the scene is rendered
 //
 // `density` has X * Y * Z numbers, z fastest; `heat`, if given, as many, with the light that is emitted per unit of length
-// at 1 as `emission`. `made` of `update` is 'blend', as in wlm, 'network', or 'march', which is the fastest.
+// at 1 as `emission`. `made` of `update` is 'network', as in wlm, or 'march', which is faster.
 
 @CORE@
 
@@ -93,7 +93,7 @@ export async function loadLiveSmoke(url, THREE, renderer) {
       mesh.geometry.dispose();
       mesh.geometry = new THREE.PlaneGeometry(extent, extent);
     },
-    update(camera, {size = 256, made = 'blend'} = {}) {
+    update(camera, {size = 256, made = 'network'} = {}) {
       if (!volume) return;
       for (const each of [camera, mesh]) each.updateWorldMatrix(true, false);
       const turn = mesh.getWorldQuaternion(new THREE.Quaternion()).invert(), axes = [0, 1, 2].map((n) => (

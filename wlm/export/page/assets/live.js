@@ -326,60 +326,20 @@ void main()
     if (u_half == 1) four.zw = min(four.zw, vec2(1.0));
 }`;
 
-// The gate of `wlm/smoke/network/prediction.py`: of the lights, the opacity and the emission, the products of the network's
-// change and the other guide's difference, and the squares of the change, summed along a row of the other guide.
-const CHANGES = `${HEAD}
-uniform sampler2D u_sides, u_rest, u_first, u_second, u_other_sides, u_other_rest;
-uniform ivec2 u_begin;
-uniform int u_apart, u_count;
-out vec4 sums;
-void main()
-{
-    ivec2 q = ivec2(gl_FragCoord.xy);
-    sums = vec4(0.0);
-    for (int n = 0; n < u_count; ++n) {
-        ivec2 other = ivec2(n, q.y), p = u_begin + u_apart * other;
-        vec4 sides = texelFetch(u_sides, p, 0), rest = texelFetch(u_rest, p, 0).xywz;
-        vec4 a = texelFetch(u_first, p, 0) - sides, b = texelFetch(u_second, p, 0) - rest, c = a, d = b;
-        if (q.x == 0) {
-            c = texelFetch(u_other_sides, other, 0) - sides;
-            d = texelFetch(u_other_rest, other, 0).xywz - rest;
-        }
-        sums.xyz += vec3(dot(a, c) + dot(b.xy, d.xy), b.zw * d.zw);
-    }
-}`;
-
-const WEIGHTS = `${HEAD}
-uniform sampler2D u_sums;
-uniform int u_count;
-out vec4 shares;
-void main()
-{
-    vec3 products = vec3(0.0), squares = vec3(0.0);
-    for (int n = 0; n < u_count; ++n) {
-        products += texelFetch(u_sums, ivec2(0, n), 0).xyz;
-        squares += texelFetch(u_sums, ivec2(1, n), 0).xyz;
-    }
-    shares = vec4(clamp(products / max(squares, vec3(1e-30)), 0.0, 1.0), 1.0);
-}`;
-
-// The lightmaps as square roots, a blend of the guide and the network's planes.
-const BLEND = `${HEAD}
-uniform sampler2D u_sides, u_rest, u_planes, u_shares;
-uniform int u_half;
+// The lightmaps as square roots, from the planes of the guide or of the network.
+const ROOTS = `${HEAD}
+uniform sampler2D u_planes;
+uniform int u_half, u_guide, u_hot;
 out vec4 four;
 ${CURVE}
 void main()
 {
-    ivec2 p = ivec2(gl_FragCoord.xy);
-    vec3 share = texelFetch(u_shares, ivec2(0), 0).xyz;
-    vec4 guide = u_half == 0 ? texelFetch(u_sides, p, 0) : texelFetch(u_rest, p, 0).xywz;
-    vec4 code = mix(guide, texelFetch(u_planes, p, 0), u_half == 0 ? share.xxxx : share.xxyz), light = wlm_linear(code);
-    if (u_half == 1) light.zw = vec2(code.z, min(light.w / max(1.0 - light.w, 1e-6), 65504.0));
+    vec4 code = texelFetch(u_planes, ivec2(gl_FragCoord.xy), 0);
+    if (u_half == 1 && u_guide == 1) code = code.xywz;
+    vec4 light = wlm_linear(code);
+    if (u_half == 1) light.zw = vec2(code.z, u_hot == 1 ? min(light.w / max(1.0 - light.w, 1e-6), 65504.0) : 0.0);
     four = sqrt(light);
 }`;
-
-const APART = 3, OTHER_SEED = 32;  // of the other guide: the distance of its pixels, and its noise
 
 const ceilTo = (n, step) => Math.ceil(n / step) * step;
 const partsOf = (length, step) => Math.max(Math.ceil(length / step - 1e-6), 1);
@@ -412,7 +372,6 @@ class LiveSmoke {
   // floats in `weights`; null: only the march.
   constructor(graphics, network, weights) {
     Object.assign(this, {graphics, network, programs: new Map(), targets: new Map()});
-    [this.none, this.all] = [0, 1].map((share) => graphics.fours(new Float32Array(4).fill(share)));
     if (network) this.#pack(network, weights);
   }
 
@@ -436,9 +395,9 @@ class LiveSmoke {
   discard({fields}) { this.graphics.discard(...Object.values(fields)); }
 
   // Computes the lightmaps of a `volume` seen by an orthographic camera: its axes, the point in the middle of its image and
-  // the image's height in the world, and its size. They are `made` by the march, the network, or a blend of both. Returns
-  // textures of square roots, `first` and `second`, and of a blend that of the network's weights.
-  render(volume, {right, up, toward, target, extent, width, height}, made = 'blend') {
+  // the image's height in the world, and its size. They are `made` by the network, if there is one, or by the march. Returns
+  // textures of square roots, `first` and `second`.
+  render(volume, {right, up, toward, target, extent, width, height}, made = 'network') {
     const {gl} = this.graphics, {shape, march, voxel, origin} = volume, forward = toward.map((x) => -x), size = [width, height];
     const middle = target.map((x, i) => (x - origin[i]) / voxel), axes = [right, up, forward];
     const common = {
@@ -448,31 +407,15 @@ class LiveSmoke {
     const sums = this.#sums(common, volume);
     gl.disable(gl.DEPTH_TEST);
     const radius = 0.5 * Math.hypot(...shape), ahead = forward.reduce((sum, a, i) => sum + a * (0.5 * shape[i] - middle[i]), 0);
-    const guideOf = (name, size, apart, jitter, seed) => {
-      const [u_sides, u_rest, u_surface] = this.#pass(MARCH, this.#target(name, ...size, {count: 3}), {
-        ...common, u_sums: sums, u_heat: volume.fields.heat ?? volume.fields.density, u_size: size, u_step: [march.step, jitter, march.cutoff], u_seed: seed,
-        u_depth: [march.threshold, ahead - radius, 2 * radius], u_pitch: apart * extent / height / voxel, u_emission: volume.heat ?? 0,
-      }).each;
-      return {u_sides, u_rest, u_surface};
-    };
-    const guide = guideOf('guide', size, 1, march.jitter, 0);
-    let planes = [guide.u_sides, guide.u_rest], shares;
-    if (this.network && made !== 'march') {
-      planes = this.#infer(guide, width, height);
-      const few = size.map((n) => Math.floor(n / APART) - (n - Math.floor(n / APART)) % 2), [across, down] = few;
-      if (made === 'blend' && Math.min(...few) > 0) {
-        const other = guideOf('other', few, APART, 1, OTHER_SEED);
-        const u_sums = this.#pass(CHANGES, this.#target('changes', 2, down, {form: this.graphics.single()}), {
-          ...guide, u_first: planes[0], u_second: planes[1], u_other_sides: other.u_sides, u_other_rest: other.u_rest,
-          u_begin: size.map((n, i) => Math.floor((n - APART * few[i]) / 2) + Math.floor(APART / 2)), u_apart: APART, u_count: across,
-        });
-        shares = this.#pass(WEIGHTS, this.#target('shares', 1, 1, {form: this.graphics.single()}), {u_sums, u_count: down});
-      }
-    }
-    const [first, second] = [0, 1].map((u_half) => this.#pass(BLEND, this.#target(`maps ${u_half}`, width, height, {filter: gl.LINEAR}), {
-      ...guide, u_planes: planes[u_half], u_shares: shares ?? (made === 'network' ? this.all : this.none), u_half,
+    const [u_sides, u_rest, u_surface] = this.#pass(MARCH, this.#target('guide', ...size, {count: 3}), {
+      ...common, u_sums: sums, u_heat: volume.fields.heat ?? volume.fields.density, u_size: size, u_step: [march.step, march.jitter, march.cutoff], u_seed: 0,
+      u_depth: [march.threshold, ahead - radius, 2 * radius], u_pitch: extent / height / voxel, u_emission: volume.heat ?? 0,
+    }).each;
+    const predicted = this.network && made === 'network', planes = predicted ? this.#infer({u_sides, u_rest, u_surface}, width, height) : [u_sides, u_rest];
+    const [first, second] = [0, 1].map((u_half) => this.#pass(ROOTS, this.#target(`maps ${u_half}`, width, height, {filter: gl.LINEAR}), {
+      u_planes: planes[u_half], u_half, u_guide: predicted ? 0 : 1, u_hot: volume.fields.heat ? 1 : 0,
     }));
-    return {first, second, shares};
+    return {first, second};
   }
 
   #pass(shader, target, values) {

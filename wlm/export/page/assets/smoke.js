@@ -137,7 +137,7 @@ class SmokePage {
     Object.assign(manifest, {exposure: 1, width: 1, height: 1});
     manifest.smoke.planes = [...PLANE_NAMES.slice(0, 7), ...frames.some(({heat}) => heat) ? ['emission'] : []];
     this.lamp = this.toward;  // towards the light, in the world
-    Object.assign(this, {turns: true, turn: 30, tilt: 10, size: Number(SIZES[0]), grows: true, times: 0, changed, made: network ? 'blend' : 'march'});
+    Object.assign(this, {turns: true, turn: 30, tilt: 10, size: Number(SIZES[0]), grows: true, times: 0, changed, made: network ? 'network' : 'march'});
     this.live = new LiveSmoke(this.graphics, network, page.array('weights', Uint16Array));
     const angle = (name, most) => panel.slider(name, {
       min: -most, max: most, step: 1, value: this[name], text: (value) => `${value}°`, changed: (value) => { this[name] = value; this.stale = true; changed(); },
@@ -146,7 +146,7 @@ class SmokePage {
     panel.choices('drag', ['view', 'light'], 'view', (name) => { this.turns = name === 'view'; });
     this.choose = panel.choices('texels', SIZES, SIZES[0], (name) => { this.resize(Number(name)); changed(); });
     if (network) {
-      panel.choices('made by', ['blend', 'network', 'march'], 'blend', (name) => { Object.assign(this, {made: name, stale: true}); changed(); });
+      panel.choices('made by', ['network', 'march'], 'network', (name) => { Object.assign(this, {made: name, stale: true}); changed(); });
     }
     this.panel = panel;
     this.stale = true;
@@ -179,7 +179,7 @@ class SmokePage {
       this.shown = this.frame;
     }
     const view = this.view(), begin = performance.now();
-    const {first, second, shares} = this.live.render(this.smoke, view, made);
+    const {first, second} = this.live.render(this.smoke, view, made);
     // Reading waits until the lightmaps are drawn.
     this.graphics.read(second, 1, 1);
     const time = performance.now() - begin;
@@ -187,7 +187,6 @@ class SmokePage {
     this.frames = {[this.frame]: {u_first: first, u_second: second, u_most: [1, 1, 1]}};
     this.panel.figure('lightmaps', `${this.size} × ${this.size} texels`);
     this.panel.figure('time for them', `${time.toFixed(1)} ms`);
-    if (shares) this.panel.figure('weight of the network', `${(100 * this.graphics.read(shares)[0]).toFixed(0)}%`);
     this.stale = made !== this.made;
     // The first times have the compilation of the shaders in them.
     if (this.grows && ++this.times > 2 && time < FAST && this.size < Number(SIZES.at(-1))) {
