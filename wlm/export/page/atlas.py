@@ -92,9 +92,8 @@ def atlas_page(
         arrays["mask"] = mesh.mask.astype(np.uint8) * 255
         manifest["reference"] = {"times": [0.0]}
         inside = mesh.mask & (texel_triangles(mesh, height, width, "cpu")[0].numpy() >= 0)
-        error = np.square(decoded - light)[inside]
-        mean, peak = (float(error.mean(dtype=np.float64)), float(np.ptp(light[inside]))) if error.size else (math.nan, 0.0)
-        psnr = psnr_from_mse(mean, peak)
+        error = float(np.square(decoded - light)[inside].mean(dtype=np.float64)) if inside.any() else math.nan
+        psnr = psnr_from_mse(error, float(np.ptp(light[mesh.mask])))
         scores = [("PSNR of texels", "–" if math.isnan(psnr) else f"{psnr:.2f} dB")]
     stored = int(np.subtract(*codec.sizes(model)))
     figures = [
