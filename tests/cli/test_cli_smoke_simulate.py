@@ -43,6 +43,7 @@ def test_simulate(jet, tmp_path):
     scene, out = jet / "jet.yaml", tmp_path / "out"
     text = call("smoke", "simulate", scene, "-o", out, "--device", "cpu,cpu")
     assert re.search(r"voxels of the smoke +│ +16 x 20 x 16 │", text) and "simulate: 4 of 4, smoke" in call.stderr
+    assert "warning" not in call.stderr
     assert sorted(os.listdir(out)) == [*(f"frame_{i:04d}.npz" for i in range(1, 5)), "scene.json"]
     footage = load_frames(out)
     assert footage.scene == Scene.model_validate(JET)

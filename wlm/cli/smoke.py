@@ -101,7 +101,7 @@ def simulate(
         def progress(now: Progress) -> None:
             nonlocal most
             figures.update(now.figures)
-            most = max(most, figures.get("smoke", 0.0))
+            most = max(most, figures.get("smoke m³", 0.0))
             report(now)
 
         options = {"resume": resume, "checkpoint_every": checkpoint_every, "volumes": volumes}
@@ -116,7 +116,7 @@ def simulate(
     }
     if figures:
         facts |= {"smoke at the end, m³ of density 1": figures["smoke m³"], "seconds per frame": figures["frame s"]}
-        if not most and not warnings:
+        if first == 1 and not most and not warnings:
             _note_no_smoke(scene)
     console.show_facts(f"{output}: {scene.name}", facts)
 

@@ -30,12 +30,11 @@ from wlm.probe.volume.light import StoredLight
 from wlm.probe.volume.walk import settle
 from wlm.scene import Mesh, Scene, load
 from wlm.scene.probes import SIDE
-from wlm.system import OnProgress
+from wlm.system import Meter, OnProgress
 from wlm.texels import fill_gaps, repair
 
 _PATH_RATE = 20  # positions of the camera's path a second
 _PLACES = 64  # places on the path of a moving object at which its light is stored
-_ROWS = 4096  # blocks of light that have memory
 _FIRST_HOUR = 12.0  # of the page; an hour with an original if there is one
 _FIRST_SIDE = 512  # most texels along a side of the light of the first picture
 _FILMIC = 1  # of the tones of the script
@@ -57,7 +56,7 @@ def _page(scene: Scene, progress: OnProgress | None) -> Page:
         times = [*own.times.tolist(), float(own.times[0]) + (own.period or 0.0)]
         entry["lightmap"]["switches"] = [times[i : i + 2] for i in Clock(own.axis).switches]
     probes = _day_volume(scene.probes) if scene.moving or scene.smoke else None
-    parts, moving = _moving(scene, probes)
+    parts, moving = _moving(scene, probes, progress)
     arrays |= _mesh("mesh", scene.mesh, "uv") | parts
     parts, smoke = _smoke(scene, probes, progress)
     arrays |= parts
@@ -118,13 +117,18 @@ def _mesh(name: str, mesh: Mesh, further: str) -> dict[str, np.ndarray]:
     return {f"{name}_{part}": values for part, values in parts.items()}
 
 
-def _moving(scene: Scene, probes: Volume | None) -> tuple[dict[str, np.ndarray], list[dict[str, Any]]]:
+def _moving(
+    scene: Scene, probes: Volume | None, progress: OnProgress | None
+) -> tuple[dict[str, np.ndarray], list[dict[str, Any]]]:
     """Returns the arrays of moving objects, with the coefficients [hours, places, 27] along their paths, and rows."""
     arrays, rows = dict[str, np.ndarray](), []
+    meter = Meter(progress, "light of moving objects", len(scene.moving))
     for i, each in enumerate(scene.moving):
         places = [each.centre(each.pose(each.seconds * k / _PLACES)) for k in range(_PLACES)]
         arrays |= _mesh(f"moving_{i}", each.mesh, "normal") | {f"moving_{i}_light": _probe_light(probes, places)}
         rows.append({"path": each.path.tolist(), "seconds": each.seconds, "places": _PLACES})
+        if meter.due(len(rows)):
+            meter.report(len(rows))
     return arrays, rows
 
 
@@ -149,9 +153,7 @@ def _day_volume(model: ProbeModel) -> Volume:
     for time in model.times.tolist() or [0.0]:
         decoder.set_time(time)
         light.append(decoder.decode_probes())
-    return Volume(
-        decoder.own_positions(), StoredLight(np.concatenate(light, 1)), live=model.live, side=SIDE, rows=_ROWS
-    )
+    return Volume(decoder.own_positions(), StoredLight(np.concatenate(light, 1)), live=model.live, side=SIDE)
 
 
 def _probe_light(probes: Volume, places: Sequence[np.ndarray]) -> np.ndarray:
