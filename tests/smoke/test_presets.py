@@ -9,7 +9,7 @@ from wlm.smoke.scene import load_scene, make_camera
 from wlm.smoke.simulation import advance, make_solver, volume_of, warnings_of
 from wlm.smoke.transport.lighting import light_smoke
 from wlm.smoke.transport.orders import orders_march
-from wlm.view.smoke import picture
+from wlm.view.smoke import Drawing
 
 PRESETS = [name for name in profile_names("smoke") if not name.startswith("network")]
 
@@ -34,9 +34,11 @@ def test_a_preset_small(name: str):
             advance(scene, solver, frame)
         if frame in (0, 12):
             volume, looks = volume_of(scene, solver), scene.looks(frame)
-            how = {"ramp": looks.ramp, "obstacles": looks.obstacles, "time": looks.time}
-            lit = light_smoke(volume, camera, lights, orders_march(volume, 0.0))
-            pictures.append(picture(lit, background=looks.background, **how))
+            how = {"background": looks.background, "ramp": looks.ramp, "obstacles": looks.obstacles}
+            drawing = Drawing(camera, lights, **how)
+            drawing.move(looks.time)
+            lit = light_smoke(drawing.among(volume), camera, lights, orders_march(volume, 0.0))
+            pictures.append(drawing(lit))
     before, after = pictures
     assert torch.isfinite(after).all() and np.isfinite(solver.velocity.numpy()).all()
     assert ((after - before).abs().amax(-1) > 0.02).float().mean() > 0.001

@@ -40,7 +40,7 @@ from wlm.smoke.shading import PointLight
 from wlm.smoke.simulation import warnings_of
 from wlm.smoke.transport.lighting import light_smoke
 from wlm.smoke.transport.orders import orders_march
-from wlm.view.smoke import picture
+from wlm.view.smoke import Drawing
 
 BOX = {"shape": "box"}
 QUICK = (*range(5), 111, 121, 129)
@@ -150,8 +150,10 @@ def test_random_scenes(seed, tmp_path):
         assert k + 1 in bodies or body.eased.moves or any(f"obstacles.{k}:" in each for each in warnings)
     volume = simulation.volume_of(scene, solver)
     camera = make_camera(CameraSettings(resolution=6), scene.grid.origin, scene.grid.size)
-    lit = light_smoke(volume, camera, [light.light() for light in scene.lights], orders_march(volume))
-    assert torch.isfinite(picture(lit, obstacles=scene.obstacles, time=scene.time(scene.frames))).all()
+    lights = [light.light() for light in scene.lights]
+    drawing = Drawing(camera, lights, obstacles=scene.obstacles)
+    drawing.move(scene.time(scene.frames))
+    assert torch.isfinite(drawing(light_smoke(drawing.among(volume), camera, lights, orders_march(volume)))).all()
 
 
 def test_fire_of_a_scene(tmp_path):
