@@ -120,6 +120,12 @@ def test_the_scores_of_a_page_are_those_of_evaluate(tmp_path):
     page = make_page([tmp_path / "probe.wlm"], original=tmp_path / "probes.npz")
     score = wlm.probe.evaluate(probes, wlm.probe.load(tmp_path / "probes.npz")).psnr
     assert dict(page.figures)["PSNR of coefficients"] == f"{score:.2f} dB"
+    mesh = atlas_meshes.charts()
+    baked = wlm.atlas.compress(mesh, wlm.atlas.Profile(name="tiny", views=2))
+    baked.save(tmp_path / "room.wlm")
+    page = make_page([tmp_path / "room.wlm"], original=atlas_meshes.write_files(tmp_path, mesh)[1])
+    score = wlm.atlas.evaluate(baked, mesh).texel_psnr  # its peak is that of the views
+    assert abs(float(dict(page.figures)["PSNR of texels"].split()[0]) - score) < 0.2
 
 
 def test_a_dark_hour_has_no_score_and_its_page_is_made(tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,6 +13,7 @@ import numpy as np
 from wlm.atlas import codec
 from wlm.atlas.model import BLOCK_SIDE, SIDE_BITS
 from wlm.atlas.shader import glsl
+from wlm.atlas.views import texel_triangles
 from wlm.errors import WlmError
 from wlm.export.page.html import Page, compare_sizes, pack_triangles
 from wlm.export.page.materials import pack_materials
@@ -89,8 +91,10 @@ def atlas_page(
         arrays["original_0"] = pack_rgb9e5(fill_gaps(light, mesh.mask))
         arrays["mask"] = mesh.mask.astype(np.uint8) * 255
         manifest["reference"] = {"times": [0.0]}
-        error = float(np.square(decoded - light)[mesh.mask].mean(dtype=np.float64))
-        scores = [("PSNR of texels", f"{psnr_from_mse(error, float(np.ptp(light[mesh.mask]))):.2f} dB")]
+        inside = mesh.mask & (texel_triangles(mesh, height, width, "cpu")[0].numpy() >= 0)
+        error = float(np.square(decoded - light)[inside].mean(dtype=np.float64)) if inside.any() else math.nan
+        psnr = psnr_from_mse(error, float(np.ptp(light[mesh.mask])))
+        scores = [("PSNR of texels", "–" if math.isnan(psnr) else f"{psnr:.2f} dB")]
     stored = int(np.subtract(*codec.sizes(model)))
     figures = [
         ("file without the mesh", f"{stored:,} bytes"),

@@ -81,7 +81,7 @@ def probe_page(
         ("bits per probe", f"{file_bytes * 8 / model.probes:.1f}"),
         *compare_sizes(file_bytes, 4 * model.outputs * model.probes * max(len(whole.times), 1), "float32"),
         ("live probes", f"{len(places):,} of {model.probes:,}"),
-        *((name, str(value)) for name, value in model.content.facts().items()),
+        *((name.replace("_", " "), str(value)) for name, value in model.content.facts().items()),
         ("profile", model.profile.name),
     ]
     if original is not None:
