@@ -1,4 +1,4 @@
-"""What kernels wait for (`python -m benchmarks kernels-profile`; needs CUDA and Nsight Compute).
+"""Profiles of kernels and what they wait for (`python -m benchmarks kernels-profile`; needs CUDA and Nsight Compute).
 
 Nsight Compute (`ncu`) counts for each kernel of a case of `benchmarks.kernel_cases`, at its largest size: how busy the
 memory, the L2 cache and the issue of instructions are, as shares of their peaks, how many of the possible warps are

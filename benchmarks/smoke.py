@@ -701,7 +701,7 @@ def _drawn(
     hot = replace(volume, temperature=volume.density, emission=1.0)
     six, every = Lighting(None), Lighting(scene.smoke.albedo)
     return {
-        "six ways, drawn": lambda: drawing(six(drawing.among(volume), camera, lights)),
+        "six ways, drawn": lambda: drawing(six(volume, camera, lights)),
         "all orders, drawn": lambda: drawing(every(drawing.among(volume), camera, lights)),
         "all orders, no obstacle": lambda: every(volume, camera, lights).shade(background=scene.background),
         "all orders of a point light": lambda: scatter(volume, camera, [lamp], scene.smoke.albedo),

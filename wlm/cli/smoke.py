@@ -260,12 +260,11 @@ def light(
             thickness = max(thickness, volume.thickness)
             view, looks = frames.view(camera, volume), frames.looks(frame)
             march, lamps = orders_march(volume, g), [*own, *twelve]
-            extra: dict[str, Any] = {} if looks is None else {"background": looks.background, "ramp": looks.ramp}
+            extra: dict[str, Any] = {"albedo": colour, "device": device_name(volume.device)}
             if looks is not None:
-                extra["obstacles"] = looks.obstacles
-            extra |= {"albedo": colour, "device": device_name(volume.device)} | (
-                {} if behind is None else {"background": behind}
-            )
+                extra |= {"background": looks.background, "ramp": looks.ramp, "obstacles": looks.obstacles}
+            if behind is not None:
+                extra["background"] = behind
             drawing = Drawing(view, lamps, **extra)
             drawing.move(0.0 if looks is None else looks.time)
             volume = drawing.among(volume)

@@ -11,7 +11,7 @@ import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import torch
@@ -31,7 +31,9 @@ from wlm.formats.reading import FileBytes, open_file, read_file
 from wlm.formats.vdb import LARGEST, GridHead, VdbFile
 from wlm.formats.vdb_writing import encode_vdb
 from wlm.interop import check_device, to_warp
-from wlm_kernels.smoke.march import Solid
+
+if TYPE_CHECKING:
+    from wlm_kernels.smoke.march import Solid
 
 EDGE = 8
 """Voxels along an edge of a brick."""

@@ -41,10 +41,10 @@ class Lighting:
         return "lightmaps" if self.albedo is None else "light of all orders"
 
     def __call__(self, volume: DensityVolume, camera: Camera, lights: Sequence[AnyLight]) -> SixWay | ScatteredSmoke:
-        """Lights the smoke on its device. Lightmaps include the depth of the smoke's surface."""
+        """Lights the smoke on its device. Lightmaps are made of smoke without obstacles, and include the depth of its
+        surface, on which a `Drawing` draws their shadows."""
         if self.albedo is not None:
             return scatter(volume, camera, lights, self.albedo)
-        volume = replace(volume, solid=None)  # obstacles shadow the lightmaps' surface
         if self.network is None:
             return bake_coarse(volume, camera, coarse_march(volume))
         six = self.network(volume, camera)
@@ -97,7 +97,8 @@ def run(
         volume = volume_of(scene, solver)
         clock.stop(SIMULATION)
         drawing.move(scene.time(number))
-        made = lighting(drawing.among(volume), camera, lights)
+        # Obstacles shadow the surface of lightmaps when these are drawn.
+        made = lighting(volume if lighting.albedo is None else drawing.among(volume), camera, lights)
         clock.stop(lighting.stage)
         drawing(made)
         clock.stop(DRAWING)

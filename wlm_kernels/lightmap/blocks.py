@@ -31,7 +31,8 @@ def index_level(index: int) -> int:
 
 @wp.func
 def ste_weight(w: float, quantised: int) -> float:
-    """Returns w clamped to [0, 1], or if quantised the nearest BC7 weight. The adjoint treats the derivative as 1."""
+    """Returns w clamped to [0, 1], or if `quantised` is 1 the nearest BC7 weight. The adjoint takes the
+    derivative as 1."""
     if quantised != 1:
         return wp.clamp(w, 0.0, 1.0)
     return float(index_level(weight_index(w))) / 64.0
@@ -63,7 +64,8 @@ def endpoint_byte(e: wp.vec4) -> wp.vec4:
 
 @wp.func
 def ste_endpoint(e: wp.vec4, quantised: int) -> wp.vec4:
-    """Returns e clamped to [0, 1], or if quantised its stored bytes / 255. The adjoint treats the derivative as 1."""
+    """Returns e clamped to [0, 1], or if `quantised` is 1 its stored bytes / 255. The adjoint takes the
+    derivative as 1."""
     if quantised != 1:
         return wp.vec4(
             wp.clamp(e[0], 0.0, 1.0),
