@@ -93,7 +93,7 @@ def pages(paths: Sequence[str | os.PathLike[str]], index: str | os.PathLike[str]
             continue
         pictures = sorted((index.parent / "images").glob(f"bench-{system}*.png"))
         plots = [f"![{picture.stem}](../images/{picture.name})\n" for picture in pictures]
-        rest = f"This page has some of {len(measured)} rows; `python -m benchmarks report FILE` prints all rows of a file.\n"
+        rest = f"This page has some of {len(measured)} rows. `python -m benchmarks report FILE` prints all rows.\n"
         runs_shown = ["## Measured by\n", *(f"- {command}" for command in commands), ""]
         page = f"{index.stem}/{system}.md"
         contents[page] = "\n".join([f"# Results: {system}\n", f"{head}\n", *plots, rest, *parts, *runs_shown])
