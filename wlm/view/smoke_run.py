@@ -24,7 +24,7 @@ from wlm_kernels.smoke.settings import March
 SIMULATION, DRAWING, BYTES = "simulation", "shadows and picture", "bytes"
 """Names of the stages of a frame, besides that of the lighting."""
 
-_SURFACE = March(step=2.0, jitter=0.0)  # march to the surface on which shadows fall, where that of the lightmaps found none
+_SURFACE = March(step=2.0, jitter=0.0)  # march to the surface on which shadows fall, where lightmaps have no depth
 
 
 @dataclass(frozen=True)
