@@ -12,32 +12,13 @@ The tables are those of `wlm.formats.bc6h`; imagecodecs' decoder is the referenc
 
 import warp as wp
 
-from wlm_kernels.block_lines import (
-    ALL,
-    HUGE,
-    TEXELS,
-    Colours,
-    Ends,
-    Indices,
-    Moments,
-    Sums,
-    Texels,
-    added,
-    axis_of,
-    ends_of,
-    gathered,
-    in_mask,
-    moments_of,
-    scaled_place,
-    spread,
-    sums_of,
-)
+from wlm_kernels import block_lines as lines
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 
 _POWER_ROUNDS = wp.constant(4)
 _AXIS_ROUNDS = wp.constant(8)
-_REFINED = wp.constant(2)  # number of fits of a line to its texels' nearest indices
+_REFINED = wp.constant(2)  # number of fits of a line to its texels' lines.nearest indices
 _REFITTED = wp.constant(2)  # number of refits of a block's endpoints to its indices
 _TRIED = wp.constant(2)  # number of partitions tried that are encoded
 
@@ -69,33 +50,23 @@ class _Block:
     mode: int
     partition: int
     code: _Codes
-    index: Indices
-    light: Colours
+    index: lines.Indices
+    light: lines.Colours
 
 
 @wp.func
-def _fitted(texels: Texels, mask: int, ends: Ends, line: int, moments: Moments, steps: int) -> Ends:
-    """Fits a line to the texels in `mask`, a bit each: the extremes along their principal axis, refined twice by least
-    squares.
+def _fitted(
+    texels: lines.Texels, mask: int, ends: lines.Ends, line: int, moments: lines.Moments, steps: int
+) -> lines.Ends:
+    """Fits a line to the texels in `mask`: the extremes along their principal axis, refined twice by least squares.
 
     Of the endpoints of both lines, rows 2 `line` and 2 `line` + 1 are replaced. `moments` are those of these texels;
     `steps` is the largest index, which selects the line's second end.
     """
-    principal = axis_of(moments, _AXIS_ROUNDS)
-    axis = wp.vec3(principal[0], principal[1], principal[2])
-    low = float(HUGE)
-    high = float(-HUGE)
-    for i in range(TEXELS):
-        if in_mask(mask, i):
-            t = wp.dot(scaled_place(texels, i), axis)
-            low = wp.min(low, t)
-            high = wp.max(high, t)
-    mean = wp.vec3(moments[1], moments[2], moments[3]) / wp.max(moments[0], 1.0e-30)
-    centre = wp.dot(mean, axis)
-    a = texels.middle + wp.cw_div(mean + axis * (low - centre), texels.metric)
-    b = texels.middle + wp.cw_div(mean + axis * (high - centre), texels.metric)
+    principal = lines.axis_of(moments, _AXIS_ROUNDS)
+    a, b = lines.extremes(texels, mask, moments, wp.vec3(principal[0], principal[1], principal[2]))
     for _round in range(_REFINED):
-        a, b = ends_of(sums_of(texels, mask, a, b, steps), a, b)
+        a, b = lines.ends_of(lines.sums_of(texels, mask, lines.nearest(texels, a, b, steps)), a, b)
     ends[2 * line] = a
     ends[2 * line + 1] = b
     return ends
@@ -113,7 +84,7 @@ def _whole(code: int, bits: int) -> int:
 
 @wp.func
 def _coded(place: float, bits: int) -> int:
-    """Returns the code of `bits` bits that expands to the 16-bit value nearest to `place`."""
+    """Returns the code of `bits` bits that expands to the 16-bit value lines.nearest to `place`."""
     top = (1 << bits) - 1
     if bits == 16:
         return wp.clamp(int(place + 0.5), 0, top)
@@ -132,7 +103,7 @@ def _share(index: int, steps: int) -> int:
 
 
 @wp.func
-def _finest(tables: Tables, ends: Ends, first: int, last: int, count: int) -> int:
+def _finest(tables: Tables, ends: lines.Ends, first: int, last: int, count: int) -> int:
     """Finds the most precise of the modes `first` to `last` - 1 that can store the first `count` ends; -1 if none can.
     Most modes store all ends but the first as differences to it, which have fewer bits."""
     best = int(-1)
@@ -152,23 +123,23 @@ def _finest(tables: Tables, ends: Ends, first: int, last: int, count: int) -> in
 
 
 @wp.func
-def _encoded(texels: Texels, tables: Tables, ends: Ends, mode: int, partition: int) -> _Block:
+def _encoded(texels: lines.Texels, tables: Tables, ends: lines.Ends, mode: int, partition: int) -> _Block:
     """Encodes a block in a mode: rounds the ends and chooses the index with the least error for each texel."""
     block = _Block()
     block.mode = mode
     block.partition = partition
     bits = tables.modes[mode, 3]
-    lines = int(1)
+    count = int(1)
     mask = int(0)
     anchor = int(0)
     steps = int(15)
     if mode < 10:
-        lines = 2
+        count = 2
         mask = tables.masks[partition]
         anchor = tables.anchors[partition]
         steps = 7
-    palette = Colours()
-    for line in range(lines):
+    palette = lines.Colours()
+    for line in range(count):
         for c in range(3):
             block.code[2 * line, c] = _coded(ends[2 * line][c], bits)
             block.code[2 * line + 1, c] = _coded(ends[2 * line + 1][c], bits)
@@ -179,14 +150,14 @@ def _encoded(texels: Texels, tables: Tables, ends: Ends, mode: int, partition: i
                 mixed = ((64 - share) * low + share * high + 32) >> 6
                 palette[8 * line + k, c] = tables.halves[(mixed * 31) >> 6]
     error = float(0.0)
-    for i in range(TEXELS):
+    for i in range(lines.TEXELS):
         start = int(0)
-        if in_mask(mask, i):
+        if lines.in_mask(mask, i):
             start = 8
         last = steps
-        if i == 0 or (lines == 2 and i == anchor):
+        if i == 0 or (count == 2 and i == anchor):
             last = steps // 2
-        best = float(HUGE)
+        best = float(lines.HUGE)
         index = int(0)
         for k in range(last + 1):
             away = palette[start + k] - texels.light[i]
@@ -202,7 +173,7 @@ def _encoded(texels: Texels, tables: Tables, ends: Ends, mode: int, partition: i
 
 
 @wp.func
-def _turned(texels: Texels, ends: Ends, line: int, anchor: int) -> Ends:
+def _turned(texels: lines.Texels, ends: lines.Ends, line: int, anchor: int) -> lines.Ends:
     """Swaps a line's ends if that brings the first end nearer to the anchor texel, whose index has one bit less."""
     a, b = ends[2 * line], ends[2 * line + 1]
     pull = texels.pull[anchor]
@@ -214,36 +185,34 @@ def _turned(texels: Texels, ends: Ends, line: int, anchor: int) -> Ends:
 
 
 @wp.func
-def _refitted(texels: Texels, block: _Block, mask: int, ends: Ends, line: int, steps: int) -> Ends:
+def _refitted(texels: lines.Texels, block: _Block, mask: int, ends: lines.Ends, line: int, steps: int) -> lines.Ends:
     """Refits the ends of a line by least squares to the indices of its texels."""
-    sums = Sums()
-    for i in range(TEXELS):
-        if in_mask(mask, i):
-            t = float(_share(block.index[i], steps)) / 64.0
-            sums = added(sums, texels.pull[i], texels.place[i], t)
-    a, b = ends_of(sums, ends[2 * line], ends[2 * line + 1])
+    shares = lines.Numbers()
+    for i in range(lines.TEXELS):
+        shares[i] = float(_share(block.index[i], steps)) / 64.0
+    a, b = lines.ends_of(lines.sums_of(texels, mask, shares), ends[2 * line], ends[2 * line + 1])
     ends[2 * line] = a
     ends[2 * line + 1] = b
     return ends
 
 
 @wp.func
-def _split(texels: Texels, tables: Tables, whole: Moments, tried: int) -> wp.vec2:
+def _split(texels: lines.Texels, tables: Tables, whole: lines.Moments, tried: int) -> wp.vec2:
     """Finds the partition, among those not in the bit mask `tried`, whose two lines fit best. Returns its number and
     the expected weighted sum of squared errors."""
-    least = float(HUGE)
+    least = float(lines.HUGE)
     partition = int(0)
     for p in range(32):
         if ((tried >> p) & 1) == 0:
-            second = moments_of(texels, tables.masks[p])
+            second = lines.moments_of(texels, tables.masks[p])
             left = float(0.0)
             along = float(0.0)
             for line in range(2):
                 part = second
                 if line == 0:
                     part = whole - second
-                left += spread(part)
-                along += axis_of(part, _POWER_ROUNDS)[3]
+                left += lines.spread(part)
+                along += lines.axis_of(part, _POWER_ROUNDS)[3]
             # An index of three bits leaves 1/49 of the scatter along a line.
             left = left - along * (48.0 / 49.0)
             if left < least:
@@ -279,7 +248,7 @@ def _write_block(number: int, block: _Block, tables: Tables, blocks: wp.array2d[
     place = int(65)
     if mode < 10:
         place = 82
-    for i in range(TEXELS):
+    for i in range(lines.TEXELS):
         own = width
         if i == 0 or i == anchor:
             own = width - 1
@@ -307,15 +276,15 @@ def _encode(
     copies of a function took the CUDA compiler half a minute.
     """
     number = wp.tid()
-    texels = gathered(light, weight, number, False)
-    whole = moments_of(texels, ALL)
+    texels = lines.gathered(light, weight, number, False)
+    whole = lines.moments_of(texels, lines.ALL)
     # An index of four bits leaves 1/225 of the scatter along a line.
-    alone = spread(whole) - axis_of(whole, _AXIS_ROUNDS)[3] * (224.0 / 225.0)
+    alone = lines.spread(whole) - lines.axis_of(whole, _AXIS_ROUNDS)[3] * (224.0 / 225.0)
     best = _Block()
-    best.error = HUGE
+    best.error = lines.HUGE
     tried = int(0)  # one bit per partition
     for attempt in range(1 + _TRIED):  # one line, then two
-        lines = int(1)
+        count = int(1)
         steps = int(15)
         partition = int(0)
         mask = int(0)
@@ -328,19 +297,19 @@ def _encode(
             partition = int(split[0])
             tried = tried | (1 << partition)
             promising = split[1] < alone
-            lines = 2
+            count = 2
             steps = 7
             mask = tables.masks[partition]
             anchor = tables.anchors[partition]
             first_mode = 0
             last_mode = 10
         if promising:
-            second = moments_of(texels, mask)
-            ends = Ends()
+            second = lines.moments_of(texels, mask)
+            ends = lines.Ends()
             block = _Block()
             for round in range(1 + _REFITTED):
-                for line in range(lines):
-                    own = ALL ^ mask
+                for line in range(count):
+                    own = lines.ALL ^ mask
                     part = whole - second
                     start = int(0)
                     if line == 1:
@@ -352,13 +321,13 @@ def _encode(
                     else:
                         ends = _refitted(texels, block, own, ends, line, steps)
                     ends = _turned(texels, ends, line, start)
-                mode = _finest(tables, ends, first_mode, last_mode, 2 * lines)
+                mode = _finest(tables, ends, first_mode, last_mode, 2 * count)
                 block = _encoded(texels, tables, ends, mode, partition)
                 if block.error < best.error:
                     best = block
-                if lines == 1:
+                if count == 1:
                     block = best
-    for i in range(TEXELS):
+    for i in range(lines.TEXELS):
         decoded[number, i] = best.light[i]
     _write_block(number, best, tables, blocks)
 

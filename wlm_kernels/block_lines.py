@@ -111,7 +111,7 @@ def moments_of(texels: Texels, mask: int) -> Moments:
 
 
 @wp.func
-def solved(products: wp.vec3, right: wp.vec2, before: wp.vec2) -> wp.vec2:
+def _solved(products: wp.vec3, right: wp.vec2, before: wp.vec2) -> wp.vec2:
     """Solves for the two ends of a channel within the format's range; returns `before` if they are underdetermined."""
     aa, ab, bb = products[0], products[1], products[2]
     determinant = aa * bb - ab * ab
@@ -130,44 +130,69 @@ def solved(products: wp.vec3, right: wp.vec2, before: wp.vec2) -> wp.vec2:
 
 
 @wp.func
-def added(sums: Sums, pull: wp.vec3, place: wp.vec3, t: float) -> Sums:
-    """Adds a texel to the normal equations; `t` is its interpolation weight of the second end."""
-    s = 1.0 - t
-    sums.aa += pull * (s * s)
-    sums.ab += pull * (s * t)
-    sums.bb += pull * (t * t)
-    weighted = wp.cw_mul(pull, place)
-    sums.ay += weighted * s
-    sums.by += weighted * t
-    return sums
-
-
-@wp.func
 def ends_of(sums: Sums, a: wp.vec3, b: wp.vec3):
     """Solves the normal equations for a line's ends; `a` and `b` are the previous ends."""
     for c in range(3):
         products = wp.vec3(sums.aa[c], sums.ab[c], sums.bb[c])
-        pair = solved(products, wp.vec2(sums.ay[c], sums.by[c]), wp.vec2(a[c], b[c]))
+        pair = _solved(products, wp.vec2(sums.ay[c], sums.by[c]), wp.vec2(a[c], b[c]))
         a[c] = pair[0]
         b[c] = pair[1]
     return a, b
 
 
 @wp.func
-def sums_of(texels: Texels, mask: int, a: wp.vec3, b: wp.vec3, steps: int) -> Sums:
-    """Sums the normal equations of a line with each texel at its nearest index, 0 to `steps`, between the ends a, b."""
-    along = b - a
+def extremes(texels: Texels, mask: int, moments: Moments, axis: wp.vec3):
+    """Returns the first and the last place of the texels in `mask` along an axis through their mean; `moments` are
+    theirs."""
+    low = float(HUGE)
+    high = float(-HUGE)
+    for i in range(TEXELS):
+        if in_mask(mask, i):
+            t = wp.dot(scaled_place(texels, i), axis)
+            low = wp.min(low, t)
+            high = wp.max(high, t)
+    mean = wp.vec3(moments[1], moments[2], moments[3]) / wp.max(moments[0], 1.0e-30)
+    centre = wp.dot(mean, axis)
+    a = texels.middle + wp.cw_div(mean + axis * (low - centre), texels.metric)
+    b = texels.middle + wp.cw_div(mean + axis * (high - centre), texels.metric)
+    return a, b
+
+
+@wp.func
+def along(texels: Texels, texel: int, a: wp.vec3, b: wp.vec3) -> float:
+    """Returns the place of a texel between two ends, from 0 to 1."""
+    pulled = wp.cw_mul(texels.pull[texel], b - a)
+    square = wp.dot(pulled, b - a)
+    t = float(0.0)
+    if square > 0.0:
+        t = wp.clamp(wp.dot(pulled, texels.place[texel] - a) / square, 0.0, 1.0)
+    return t
+
+
+@wp.func
+def nearest(texels: Texels, a: wp.vec3, b: wp.vec3, steps: int) -> Numbers:
+    """Returns the place of each texel between two ends, rounded to a number of steps."""
+    places = Numbers()
+    for i in range(TEXELS):
+        places[i] = wp.floor(along(texels, i, a, b) * float(steps) + 0.5) / float(steps)
+    return places
+
+
+@wp.func
+def sums_of(texels: Texels, mask: int, places: Numbers) -> Sums:
+    """Sums the normal equations of a line for the texels in `mask`; `places` are the second end's shares of them."""
     sums = Sums()
     for i in range(TEXELS):
         if in_mask(mask, i):
             pull = texels.pull[i]
-            pulled = wp.cw_mul(pull, along)
-            square = wp.dot(pulled, along)
-            t = float(0.0)
-            if square > 0.0:
-                t = wp.dot(pulled, texels.place[i] - a) / square
-            t = wp.clamp(wp.floor(t * float(steps) + 0.5), 0.0, float(steps)) / float(steps)
-            sums = added(sums, pull, texels.place[i], t)
+            t = places[i]
+            s = 1.0 - t
+            sums.aa += pull * (s * s)
+            sums.ab += pull * (s * t)
+            sums.bb += pull * (t * t)
+            weighted = wp.cw_mul(pull, texels.place[i])
+            sums.ay += weighted * s
+            sums.by += weighted * t
     return sums
 
 

@@ -118,9 +118,7 @@ def decode(blocks: np.ndarray, height: int, width: int, codec: str) -> np.ndarra
     if codec == "bc6h":
         texels = hdr_blocks.decode_bc6h(blocks.tobytes(), *size, _EXTRA)
     else:
-        texels = hdr_blocks.astc((BLOCK_SIDE, BLOCK_SIDE), hdr_blocks.ASTC_MEDIUM, _EXTRA).decode(
-            blocks.tobytes(), *size
-        )
+        texels = hdr_blocks.decode_astc(blocks.tobytes(), (BLOCK_SIDE, BLOCK_SIDE), *size, _EXTRA)
     texels = texels[:height, :width].astype(np.float32)
     broken = ~np.isfinite(texels).all(axis=2)
     if broken.any():

@@ -1,189 +1,146 @@
-"""Blocks of ASTC HDR with 4 x 4 texels: the subset of the format that `wlm_kernels.astc` writes.
+"""Blocks of ASTC HDR with 4 x 4 texels: tables for the part of the format that `wlm_kernels.astc` writes.
 
 A block of 128 bits stores one line in colour space, or two lines and the number of the partition that assigns texels to
 them. A line has two ends of 12 bits per channel, on a scale that is roughly the logarithm of light, which are packed
-into bytes in one of 15 layouts. The bytes are rounded to a range of numbers, as large as the bits that the texels'
-weights leave. From the lowest bit, a block contains the block mode, the number of lines, the partition, the endpoint
-mode, and the bytes; the weights start at the highest bit and grow downwards.
+into bytes in one of several layouts. From the lowest bit, a block contains the block mode, the partition, the endpoint
+mode, and the bytes, each rounded to one of as many numbers as the other bits leave room for; the texels' weights start
+at the highest bit and grow downwards.
 
-Khronos' Data Format Specification 1.4, chapter 23 ("ASTC"), specifies the format.
+Khronos' Data Format Specification 1.4, chapter "ASTC Compressed Texture Image Formats", specifies the format.
 """
-
-import math
 
 import numpy as np
 
-# Numbers of a range: 1, 3 (trits) or 5 (quints) times a power of two.
-_RANGES = [(2**bits * base, base, bits) for bits in range(9) for base in (1, 3, 5)]
-_RANGES = sorted(each for each in _RANGES if 1 < each[0] <= 256)
-_LEVELS = [levels for levels, _, _ in _RANGES]
-_PACKED = {1: (0, 1), 3: (8, 5), 5: (7, 3)}  # bits of a group of trits or quints, and numbers in the group
+# The modes in which blocks are stored: lines, endpoint mode, and the sizes of the ranges of weights and of bytes, each a
+# power of two or three times one. The format fixes the last size: it is the largest for which there is room.
+_MODES = (
+    (1, 11, 12, 256), (1, 11, 16, 192), (1, 11, 24, 64), (1, 7, 32, 192), (2, 7, 4, 256), (2, 7, 6, 128),
+    (2, 7, 12, 32), (2, 11, 3, 64), (2, 11, 6, 24),
+)  # fmt: skip
+_WEIGHTS = (2, 3, 4, 5, 6, 8, 10, 12, 16, 20, 24, 32)  # the format's ranges of weights
 
-# Factor of the trit or quint, and pattern of the low bits (a is the lowest), of colours and weights that are stored.
-_COLOUR = {
-    6: (204, "000000000"), 10: (113, "000000000"), 12: (93, "b000b0bb0"), 20: (54, "b0000bb00"),
-    24: (44, "cb000cbcb"), 40: (26, "cb0000cbc"), 48: (22, "dcb000dcb"), 80: (13, "dcb0000dc"), 96: (11, "edcb000ed"),
-    160: (6, "edcb0000e"), 192: (5, "fedcb000f"),
+# For ranges with trits, by the range and the bits of its values: the trit's factor, and the pattern of the low bits.
+_TRITS = {
+    (24, 8): (44, "cb000cbcb"), (96, 8): (11, "edcb000ed"), (192, 8): (5, "fedcb000f"),
+    (6, 6): (50, "0000000"), (12, 6): (23, "b000b0b"), (24, 6): (11, "cb000cb"),
 }  # fmt: skip
-_WEIGHT = {6: (50, "0000000"), 10: (28, "0000000"), 12: (23, "b000b0b"), 20: (13, "b0000b0"), 24: (11, "cb000cb")}
-_PLAIN = {3: (0, 32, 63), 5: (0, 16, 32, 47, 63)}
+
+# The layouts of a line's ends: endpoint mode, shift from the fields to 12 bits, number, factor of the largest channel's
+# number in the header h, and the bytes. A byte has the low bits of its field; "c7:h0,a8" is a byte of field c, of 7
+# bits, with bit 0 of h and bit 8 of a above them. The fields are the largest channel a of the brighter end, what is
+# below it in the others (g, b), in the darker end (c), and what is further below in the darker end's others (d, e, with
+# a sign). Endpoint mode 7 has no d and e: all channels of the darker end are below by c.
+_FIELDS = "agbcdeh"
+_LAYOUTS = (
+    (11, 0, 7, 8, "a12: c7:h0,a8 g6:h1,a9 b6:h2,a10 d6:h3,a11,d5 e6:h4,c6,e5"),
+    (11, 0, 6, 8, "a12: c7:h0,a8 g7:h1,g6 b7:h2,b6 d5:h3,a11,a9 e5:h4,c6,a10"),
+    (11, 1, 5, 8, "a11: c8:h0,a8 g6:h1,a9 b6:h2,a10 d6:h3,c7,d5 e6:h4,c6,e5"),
+    (11, 1, 4, 8, "a11: c6:h0,a8 g8:h1,g6 b8:h2,b6 d5:h3,g7,a9 e5:h4,b7,a10"),
+    (11, 2, 3, 8, "a10: c7:h0,a8 g7:h1,g6 b7:h2,b6 d6:h3,a9,d5 e6:h4,c6,e5"),
+    (11, 2, 2, 8, "a10: c7:h0,a8 g6:h1,a9 b6:h2,c6 d7:h3,d6,d5 e7:h4,e6,e5"),
+    (11, 3, 0, 8, "a9: c6:h0,a8 g7:h1,g6 b7:h2,b6 d7:h3,d6,d5 e7:h4,e6,e5"),
+    (11, 3, 1, 8, "a9: c6:h0,a8 g8:h1,g6 b8:h2,b6 d6:h3,g7,d5 e6:h4,b7,e5"),
+    (7, 1, 0, 4, "a11:h1,h0 g5:h2,a9,a8 b5:h3,a7,a10 c7:a6,c6,c5"),
+    (7, 1, 1, 4, "a11:h1,h0 g6:h2,a8,g5 b6:h3,a7,b5 c5:a6,a10,a9"),
+    (7, 2, 2, 4, "a10:h1,h0 g5:h2,a9,a8 b5:h3,a7,a6 c8:c7,c6,c5"),
+    (7, 3, 3, 4, "a9:h1,h0 g6:h2,a8,g5 b6:h3,a7,b5 c7:a6,c6,c5"),
+    (7, 4, 12, 1, "a8:h1,h0 g7:h2,g6,g5 b7:h3,b6,b5 c6:a6,a7,c5"),
+)
 
 
-def _bits_of(count: int, levels: int) -> int:
-    """Counts the bits of `count` numbers of a range."""
-    _, base, bits = _RANGES[_LEVELS.index(levels)]
-    packed, group = _PACKED[base]
-    return count * bits + math.ceil(count * packed / group)
+def _range(levels: int) -> tuple[int, int]:
+    """Returns 1 or 3, and the power of two by which it is multiplied."""
+    base = 3 if levels % 3 == 0 else 1
+    return base, (levels // base).bit_length() - 1
 
 
-def _expanded(levels: int, width: int, patterns: dict[int, tuple[int, str]]) -> list[int]:
+def _values(levels: int, width: int) -> list[int]:
     """Returns the value of `width` bits of each stored number of a range."""
-    _, base, bits = _RANGES[_LEVELS.index(levels)]
+    base, bits = _range(levels)
+    if levels == 3:
+        return [0, 32, 63]
     if base == 1:
-        return [int(f"{number:0{bits}b}" * width, 2) >> (bits * width - width) for number in range(levels)]
-    factor, pattern = patterns[levels]
+        return [int(f"{number:0{bits}b}" * width, 2) >> (bits - 1) * width for number in range(levels)]
+    factor, pattern = _TRITS[levels, width]
     values = []
     for number in range(levels):
-        high, low = divmod(number, 1 << bits)
-        mixed = int(
-            "".join(letter if letter == "0" else str(low >> "abcdef".index(letter) & 1) for letter in pattern), 2
-        )
-        flip = (1 << len(pattern)) - 1 if low & 1 else 0
-        values.append((flip & 1 << width - 1) | (high * factor + mixed ^ flip) >> 2)
+        trit, low = divmod(number, 1 << bits)
+        mixed = int("".join("0" if each == "0" else str(low >> "abcdef".index(each) & 1) for each in pattern), 2)
+        flip = (2 << width) - 1 if low & 1 else 0
+        values.append(flip & 1 << width - 1 | (trit * factor + mixed ^ flip) >> 2)
     return values
 
 
-def _trits(packed: int) -> tuple[int, ...]:
-    """Decodes five trits from 8 bits."""
-    if packed >> 2 & 7 == 7:
-        rest, t3, t4 = packed >> 5 << 2 | packed & 3, 2, 2
-    else:
-        rest = packed & 31
-        t3, t4 = (packed >> 7, 2) if packed >> 5 & 3 == 3 else (packed >> 5 & 3, packed >> 7)
-    if rest & 3 == 3:
-        t2, t1, t0 = 2, rest >> 4, (rest >> 3 & 1) << 1 | (rest >> 2 & ~(rest >> 3) & 1)
-    elif rest >> 2 & 3 == 3:
-        t2, t1, t0 = 2, 2, rest & 3
-    else:
-        t2, t1, t0 = rest >> 4, rest >> 2 & 3, (rest >> 1 & 1) << 1 | (rest & ~(rest >> 1) & 1)
-    return t0, t1, t2, t3, t4
-
-
-def _quints(packed: int) -> tuple[int, ...]:
-    """Decodes three quints from 7 bits."""
-    low = packed & 1
-    if packed >> 1 & 3 == 3 and packed >> 5 == 0:
-        return 4, 4, low << 2 | (packed >> 4 & ~low & 1) << 1 | (packed >> 3 & ~low & 1)
-    if packed >> 1 & 3 == 3:
-        q2, rest = 4, (packed >> 3 & 3) << 3 | (~packed >> 5 & 3) << 1 | low
-    else:
-        q2, rest = packed >> 5, packed & 31
-    return (rest >> 3, 4, q2) if rest & 7 == 5 else (rest & 7, rest >> 3, q2)
-
-
-def _groups() -> np.ndarray:
-    """Returns the packed bits of all groups of trits (row 0) and quints (row 1), by the group's digits as a number. Of
-    several codes it is the least, since a group that is cut off at its end is filled up with zeros."""
-    table = np.zeros((2, 243), np.int32)
-    for row, (base, size, decode) in enumerate(((3, 256, _trits), (5, 128, _quints))):
-        for packed in reversed(range(size)):
-            table[row, sum(digit * base**i for i, digit in enumerate(decode(packed)))] = packed
-    return table
-
-
-# For each layout of endpoint mode 11 (two colours) and 7 (a colour, and a difference to a darker one), from the finest:
-# the shift from its fields to 12 bits; its number in the format; bits of its fields, negative for signed ones; and the
-# bits of each byte above the low bits of the byte's own field, from the highest. "1.9" is bit 9 of field 1. The fields
-# of mode 11 are the format's a, c, b0, b1, d0 and d1; those of mode 7 are R, G, B and S; "h" is the layout's number
-# with that of the largest channel.
-_LAYOUTS = (
-    (11, 0, 7, (12, 7, 6, 6, -6, -6), "- h.0,0.8 h.1,0.9 h.2,0.10 h.3,0.11,4.5 h.4,1.6,5.5"),
-    (11, 0, 6, (12, 7, 7, 7, -5, -5), "- h.0,0.8 h.1,2.6 h.2,3.6 h.3,0.11,0.9 h.4,1.6,0.10"),
-    (11, 1, 5, (11, 8, 6, 6, -6, -6), "- h.0,0.8 h.1,0.9 h.2,0.10 h.3,1.7,4.5 h.4,1.6,5.5"),
-    (11, 1, 4, (11, 6, 8, 8, -5, -5), "- h.0,0.8 h.1,2.6 h.2,3.6 h.3,2.7,0.9 h.4,3.7,0.10"),
-    (11, 2, 3, (10, 7, 7, 7, -6, -6), "- h.0,0.8 h.1,2.6 h.2,3.6 h.3,0.9,4.5 h.4,1.6,5.5"),
-    (11, 2, 2, (10, 7, 6, 6, -7, -7), "- h.0,0.8 h.1,0.9 h.2,1.6 h.3,4.6,4.5 h.4,5.6,5.5"),
-    (11, 3, 1, (9, 6, 8, 8, -6, -6), "- h.0,0.8 h.1,2.6 h.2,3.6 h.3,2.7,4.5 h.4,3.7,5.5"),
-    (11, 3, 0, (9, 6, 7, 7, -7, -7), "- h.0,0.8 h.1,2.6 h.2,3.6 h.3,4.6,4.5 h.4,5.6,5.5"),
-    (11, 4, 0, (8, 8, 8, 8, 7, 7), "- - - - h.3 h.4"),
-    (7, 1, 0, (11, 5, 5, 7), "h.1,h.0 h.2,0.9,0.8 h.3,0.7,0.10 0.6,3.6,3.5"),
-    (7, 1, 1, (11, 6, 6, 5), "h.1,h.0 h.2,0.8,1.5 h.3,0.7,2.5 0.6,0.10,0.9"),
-    (7, 2, 2, (10, 5, 5, 8), "h.1,h.0 h.2,0.9,0.8 h.3,0.7,0.6 3.7,3.6,3.5"),
-    (7, 3, 3, (9, 6, 6, 7), "h.1,h.0 h.2,0.8,1.5 h.3,0.7,2.5 0.6,3.6,3.5"),
-    (7, 4, 12, (8, 7, 7, 6), "h.1,h.0 h.2,1.6,1.5 h.3,2.6,2.5 0.6,0.7,3.5"),
-    (7, 5, 15, (7, 7, 7, 7), "h.1,h.0 h.2,1.6,1.5 h.3,2.6,2.5 0.6,3.6,3.5"),
-)
-_HEADER = 6
-
-
-def _layouts() -> np.ndarray:
-    table = np.full((len(_LAYOUTS), 6, 5), -1, np.int32)
-    for row, (_, _, _, fields, text) in enumerate(_LAYOUTS):
-        for byte, (bits, word) in enumerate(zip(fields, text.split(), strict=True)):
-            codes = [] if word == "-" else [part.split(".") for part in word.split(",")]
-            table[row, byte, : len(codes)] = [
-                (_HEADER if name == "h" else int(name)) << 4 | int(bit) for name, bit in codes
-            ]
-            table[row, byte, 3:] = bits, len(codes)
-    return table
-
-
 def _modes() -> np.ndarray:
-    """Lists ways to store a block: lines, endpoint mode, and levels of the weights."""
-    ways = [(1, 11, 12), (1, 11, 16), (1, 11, 20), (1, 11, 24), (1, 7, 16), (1, 7, 24), (1, 7, 32)]
-    ways += [
-        (2, 7, 4),
-        (2, 7, 5),
-        (2, 7, 6),
-        (2, 7, 8),
-        (2, 7, 10),
-        (2, 11, 3),
-        (2, 11, 4),
-        (2, 11, 5),
-        (2, 11, 6),
-        (2, 11, 8),
-    ]
     rows = []
-    for lines, kind, levels in ways:
-        index = _LEVELS.index(levels)
-        rho, fine = index % 6 + 2, index // 6
+    for lines, kind, weights, levels in _MODES:
+        fine, rho = divmod(_WEIGHTS.index(weights), 6)
         # The grid of weights has 4 columns (bits 7 and 8: 0) and 4 rows (bits 5 and 6: 2).
-        mode = (rho >> 1) | (rho & 1) << 4 | 2 << 5 | fine << 9
-        room = 128 - (17 if lines == 1 else 29) - _bits_of(16, levels)
-        count = lines * (6 if kind == 11 else 4)
-        colours = max(i for i, each in enumerate(_LEVELS) if _bits_of(count, each) <= room)
-        rows.append((lines, kind, index, levels, colours, mode))
+        block_mode = rho + 2 >> 1 | (rho & 1) << 4 | 2 << 5 | fine << 9 | lines - 1 << 11
+        rows.append((lines, kind, block_mode, weights, *_range(weights), *_range(levels)))
     return np.array(rows, np.int32)
 
 
 def _weights() -> tuple[np.ndarray, np.ndarray]:
-    shares, codes = np.zeros((2, 12, 32), np.int32)
-    for row, levels in enumerate(_LEVELS[:12]):
-        values = _PLAIN[levels] if levels in _PLAIN else _expanded(levels, 6, _WEIGHT)
-        order = np.argsort(values)
-        shares[row, :levels] = [values[i] + (values[i] > 32) for i in order]
-        codes[row, :levels] = order
+    shares, codes = np.zeros((2, len(_MODES), 32), np.int32)
+    for row, (_, _, weights, _) in enumerate(_MODES):
+        values = np.array(_values(weights, 6))
+        codes[row, :weights] = order = np.argsort(values)
+        shares[row, :weights] = values[order] + (values[order] > 32)
     return shares, codes
 
 
 def _bytes() -> tuple[np.ndarray, np.ndarray]:
-    rounded, codes = np.zeros((len(_LEVELS), 5, 256), np.int32), np.zeros((len(_LEVELS), 256), np.int32)
-    wanted = np.arange(256)
-    for row, levels in enumerate(_LEVELS):
-        if levels < 16:
-            continue  # too few for the bits that a layout needs
-        values = np.array(_expanded(levels, 8, _COLOUR))
+    rounded, codes = np.zeros((len(_MODES), 5, 256), np.int32), np.zeros((len(_MODES), 256), np.int32)
+    wanted = np.arange(256)[:, None]
+    for row, (_, _, _, levels) in enumerate(_MODES):
+        values = np.array(_values(levels, 8))
         codes[row, values] = np.arange(levels)
         for kept in range(5):
-            far = np.abs(values - wanted[:, None]) + 1000 * (values >> 8 - kept != wanted[:, None] >> 8 - kept)
+            far = np.abs(values - wanted) + 1000 * (values >> 8 - kept != wanted >> 8 - kept)
             rounded[row, kept] = values[far.argmin(1)]
     return rounded, codes
 
 
-def _hash(seed: int) -> int:
-    """Mixes the bits of a partition's number (the specification's `hash52`)."""
-    word = np.array(seed, np.uint32)
-    word ^= word >> 15
+def _layouts() -> np.ndarray:
+    table = np.zeros((len(_LAYOUTS), 6, 7), np.int32)
+    for row, layout in enumerate(_LAYOUTS):
+        for byte, word in enumerate(layout[-1].split()):
+            own, _, tops = word.partition(":")
+            sources = [_FIELDS.index(top[0]) << 4 | int(top[1:]) for top in tops.split(",") if top]
+            bits, signed = int(own[1:]), own[0] in "de"
+            # Rounding must not change the sign, which is among the low bits of fields of 5 bits.
+            kept = len(sources) + (signed and bits == 5)
+            table[row, byte, : len(sources)] = sources
+            table[row, byte, 3:] = len(sources), kept, _FIELDS.index(own[0]), (1 << bits - signed) - 1
+    return table
+
+
+def _groups() -> np.ndarray:
+    """Returns the bits of five trits by the trits as a number, the first the lowest.
+
+    Of several codes it is the least, since a group that is cut off at its end is filled up with zeros.
+    """
+    table = np.zeros(243, np.int32)
+    for code in reversed(range(256)):
+        rest, t3, t4 = code & 31, code >> 5 & 3, code >> 7
+        if code >> 2 & 7 == 7:
+            rest, t3, t4 = code >> 5 << 2 | code & 3, 2, 2
+        elif t3 == 3:
+            t3, t4 = t4, 2
+        t0, t1, t2 = rest & 3, rest >> 2 & 3, rest >> 4
+        if t0 == 3:
+            t0, t1, t2 = t1, t2, 2
+        elif t1 == 3:
+            t1, t2 = 2, 2
+        table[min(t0, 2) + 3 * t1 + 9 * t2 + 27 * t3 + 81 * t4] = code
+    return table
+
+
+def _partitions() -> np.ndarray:
+    """Returns the different divisions of a block by two lines."""
+    seed = np.arange(1024, 2048, dtype=np.uint32)
+    word = seed ^ seed >> 15
     word -= word << 17
     word += word << 7
     word += word << 4
@@ -193,29 +150,16 @@ def _hash(seed: int) -> int:
     word ^= word >> 3
     word ^= word << 6
     word ^= word >> 17
-    return int(word)
-
-
-def _mask(number: int) -> int:
-    """Returns the texels on the second line of a partition, one bit per texel."""
-    seed = number + 1024
-    word = _hash(seed)
-    near = 4 if seed & 2 else 5
-    shifts = (near, 5) if seed & 1 else (5, near)
-    a, b, c, d = ((word >> 4 * i & 15) ** 2 >> shifts[i % 2] for i in range(4))
-    mask = 0
-    for texel in range(16):
-        y, x = divmod(texel, 4)
-        first, second = (2 * (p * x + q * y) + (word >> shift) & 63 for p, q, shift in ((a, b, 14), (c, d, 10)))
-        mask |= (first < second) << texel
-    return mask
-
-
-def _partitions() -> np.ndarray:
+    near = np.where(seed & 2, 4, 5)
+    shifts = np.where(seed & 1, near, 5), np.where(seed & 1, 5, near)
+    slopes = [((word >> 4 * i & 15) ** 2 >> shifts[i % 2])[:, None] for i in range(4)]
+    y, x = np.divmod(2 * np.arange(16), 8) * np.array([[2], [1]])
+    first = slopes[0] * x + slopes[1] * y + (word >> 14)[:, None] & 63
+    second = slopes[2] * x + slopes[3] * y + (word >> 10)[:, None] & 63
+    masks = (first < second) @ (1 << np.arange(16))
     found: dict[int, int] = {}
-    for number in range(1024):
-        mask = _mask(number)
-        if mask and mask != 0xFFFF and mask ^ 0xFFFF not in found:
+    for number, mask in enumerate(masks.tolist()):
+        if 0 < mask < 0xFFFF and mask ^ 0xFFFF not in found:
             found.setdefault(mask, number)
     return np.array([*found.items()], np.int32)
 
@@ -225,12 +169,11 @@ def _tables() -> dict[str, np.ndarray]:
     rounded, byte_codes = _bytes()
     return {
         "modes": _modes(),
-        "ranges": np.array([(base, bits) for _, base, bits in _RANGES], np.int32),
         "shares": shares,
         "weight_codes": weight_codes,
         "rounded": rounded,
         "byte_codes": byte_codes,
-        "heads": np.array([[shift, number] for _, shift, number, _, _ in _LAYOUTS], np.int32),
+        "heads": np.array([layout[1:4] for layout in _LAYOUTS], np.int32),
         "layouts": _layouts(),
         "groups": _groups(),
         "partitions": _partitions(),
