@@ -13,7 +13,7 @@ from wlm_kernels import block_lines as lines
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 
-_AXIS_ROUNDS = wp.constant(8)
+_AXIS_ROUNDS = wp.constant(5)
 _REFITTED = wp.constant(2)  # number of refits of the best block's ends to its weights
 _ALONG = wp.constant(0.2)  # what weights leave of the distances along a line
 _BASE_SCALE = wp.constant(7)  # endpoint mode whose ends differ by one factor
@@ -316,48 +316,33 @@ def _encode(
         for c in range(3):
             single = single and texels.light[i, c] == texels.light[0, c]
     if not single:
-        whole = lines.moments_of(texels, lines.ALL)
-        principal = lines.axis_of(whole, _AXIS_ROUNDS)
-        partition = _split(tables, _subsets(texels, wp.vec3(principal[0], principal[1], principal[2])))
+        axis, _along = lines.axis_of(lines.moments_of(texels, lines.ALL), _AXIS_ROUNDS)
+        partition = _split(tables, _subsets(texels, axis))
         best = _Block()
         best.error = lines.HUGE
-        start = lines.Ends()
-        begun = int(0)
         modes = tables.modes.shape[0]
         for step in range(modes + _REFITTED):
             block = _Block()
             block.mode = step
-            refit = step >= modes
-            if refit:
+            if step >= modes:
                 block.mode = best.mode
             count = tables.modes[block.mode, 0]
             kind = tables.modes[block.mode, 1]
             if count == 2:
                 block.mask = tables.partitions[partition, 0]
-            key = 16 * block.mask + kind
-            fresh = not refit and key != begun
-            second = lines.Moments()
-            if fresh:
-                begun = key
-                second = lines.moments_of(texels, block.mask)
             for line in range(count):
-                own = lines.ALL ^ block.mask
-                part = whole - second
-                if line == 1:
-                    own = block.mask
-                    part = second
-                if fresh:
+                own = block.mask
+                if line == 0:
+                    own = lines.ALL ^ own
+                a = best.ends[2 * line]
+                b = best.ends[2 * line + 1]
+                shares = best.share
+                if step < modes:
+                    part = lines.moments_of(texels, own)
                     axis = wp.normalize(texels.metric)
                     if kind != _BASE_SCALE:
-                        principal = lines.axis_of(part, _AXIS_ROUNDS)
-                        axis = wp.vec3(principal[0], principal[1], principal[2])
-                    low, high = lines.extremes(texels, own, part, axis)
-                    start[2 * line] = low
-                    start[2 * line + 1] = high
-                a = start[2 * line]
-                b = start[2 * line + 1]
-                shares = best.share
-                if not refit:
+                        axis, _along = lines.axis_of(part, _AXIS_ROUNDS)
+                    a, b = lines.extremes(texels, own, part, axis)
                     shares = lines.nearest(texels, a, b, tables.modes[block.mode, 3] - 1)
                 a, b = _fitted(lines.sums_of(texels, own, shares), a, b, kind)
                 block = _store(tables, block, line, a, b)

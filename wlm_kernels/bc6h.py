@@ -63,8 +63,8 @@ def _fitted(
     Of the endpoints of both lines, rows 2 `line` and 2 `line` + 1 are replaced. `moments` are those of these texels;
     `steps` is the largest index, which selects the line's second end.
     """
-    principal = lines.axis_of(moments, _AXIS_ROUNDS)
-    a, b = lines.extremes(texels, mask, moments, wp.vec3(principal[0], principal[1], principal[2]))
+    axis, _scatter = lines.axis_of(moments, _AXIS_ROUNDS)
+    a, b = lines.extremes(texels, mask, moments, axis)
     for _round in range(_REFINED):
         a, b = lines.ends_of(lines.sums_of(texels, mask, lines.nearest(texels, a, b, steps)), a, b)
     ends[2 * line] = a
@@ -212,7 +212,8 @@ def _split(texels: lines.Texels, tables: Tables, whole: lines.Moments, tried: in
                 if line == 0:
                     part = whole - second
                 left += lines.spread(part)
-                along += lines.axis_of(part, _POWER_ROUNDS)[3]
+                _axis, scatter = lines.axis_of(part, _POWER_ROUNDS)
+                along += scatter
             # An index of three bits leaves 1/49 of the scatter along a line.
             left = left - along * (48.0 / 49.0)
             if left < least:
@@ -279,7 +280,8 @@ def _encode(
     texels = lines.gathered(light, weight, number, False)
     whole = lines.moments_of(texels, lines.ALL)
     # An index of four bits leaves 1/225 of the scatter along a line.
-    alone = lines.spread(whole) - lines.axis_of(whole, _AXIS_ROUNDS)[3] * (224.0 / 225.0)
+    _axis, along = lines.axis_of(whole, _AXIS_ROUNDS)
+    alone = lines.spread(whole) - along * (224.0 / 225.0)
     best = _Block()
     best.error = lines.HUGE
     tried = int(0)  # one bit per partition

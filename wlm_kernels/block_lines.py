@@ -60,7 +60,7 @@ def in_mask(mask: int, texel: int) -> bool:
 
 
 @wp.func
-def axis_of(m: Moments, rounds: int) -> wp.vec4:
+def axis_of(m: Moments, rounds: int):
     """Computes the principal axis of points with the moments m, in `rounds` power iterations, and their scatter along
     it."""
     inverse = 1.0 / wp.max(m[0], 1.0e-30)
@@ -79,8 +79,7 @@ def axis_of(m: Moments, rounds: int) -> wp.vec4:
     length = wp.length(axis)
     if length > 0.0:
         axis = axis / length
-    value = wp.dot(axis, a * axis)
-    return wp.vec4(axis[0], axis[1], axis[2], wp.max(value, 0.0))
+    return axis, wp.max(wp.dot(axis, a * axis), 0.0)
 
 
 @wp.func

@@ -11,8 +11,8 @@ Khronos' Data Format Specification 1.4, chapter "ASTC Compressed Texture Image F
 
 import numpy as np
 
-# The modes in which blocks are stored: lines, endpoint mode, and the sizes of the ranges of weights and of bytes, each a
-# power of two or three times one. The format fixes the last size: it is the largest for which there is room.
+# The modes in which blocks are stored: lines, endpoint mode, and the sizes of the ranges of weights and of bytes, each
+# a power of two or three times one. The format fixes the last size: it is the largest for which there is room.
 _MODES = (
     (1, 11, 12, 256), (1, 11, 16, 192), (1, 11, 24, 64), (1, 7, 32, 192), (2, 7, 4, 256), (2, 7, 6, 128),
     (2, 7, 12, 32), (2, 11, 3, 64), (2, 11, 6, 24),

@@ -18,16 +18,18 @@ from wlm_kernels import bc6h as bc6h_kernels
 
 _FINITE = 0x7C00  # bits of the first half float that isn't finite
 _BLOCKS_A_THREAD = 256  # the least work of a thread on the CPU, about 20 ms
-_KERNELS: dict[str, ModuleType] = {"bc6h": bc6h_kernels, "astc": astc_kernels}
-_TABLES = {
-    "bc6h": {
-        "modes": bc6h.MODES,
-        "layout": bc6h.LAYOUT,
-        "masks": bc6h.MASKS,
-        "anchors": bc6h.SECOND_ANCHORS,
-        "halves": np.arange(_FINITE, dtype=np.uint16).view(np.float16).astype(np.float32),
-    },
-    "astc": astc.TABLES,
+_CODECS: dict[str, tuple[ModuleType, dict[str, np.ndarray]]] = {
+    "bc6h": (
+        bc6h_kernels,
+        {
+            "modes": bc6h.MODES,
+            "layout": bc6h.LAYOUT,
+            "masks": bc6h.MASKS,
+            "anchors": bc6h.SECOND_ANCHORS,
+            "halves": np.arange(_FINITE, dtype=np.uint16).view(np.float16).astype(np.float32),
+        },
+    ),
+    "astc": (astc_kernels, astc.TABLES),
 }
 
 
@@ -46,28 +48,25 @@ def encoded_blocks(
     check("weight", weight, (count, 16), light.device)
     light, weight = light.contiguous(), weight.contiguous()
     words = torch.zeros((count, 4), dtype=torch.int32, device=light.device)
-    decoded, tables = torch.zeros_like(light), _tables(codec, str(light.device))
+    decoded, tables, kernels = torch.zeros_like(light), _tables(codec, str(light.device)), _CODECS[codec][0]
+    # On the CPU a launch is a loop in one thread.
+    step = max(count, 1) if light.is_cuda else max(_BLOCKS_A_THREAD, math.ceil(count / cores()))
 
     def encode(first: int) -> None:
-        part = slice(first, first + step)
-        arrays = to_warp(light[part], wp.vec3), to_warp(weight[part]), tables
-        _KERNELS[codec].encode(*arrays, to_warp(words[part], wp.uint32), to_warp(decoded[part], wp.vec3))
+        parts = (part[first : first + step] for part in (light, weight, words, decoded))
+        arrays = list(map(to_warp, parts, (wp.vec3, None, wp.uint32, wp.vec3)))
+        kernels.encode(*arrays[:2], tables, *arrays[2:])
 
-    if light.is_cuda:
-        step = max(count, 1)
-        with on_stream(light.device):
-            encode(0)
-    else:
-        wp.load_module(_KERNELS[codec], "cpu")  # not by the threads
-        step = max(_BLOCKS_A_THREAD, math.ceil(count / cores()))
-        for _ in each(encode, range(0, count, step)):
-            pass
+    wp.load_module(kernels, str(light.device))  # before threads launch its kernel
+    starts = range(0, count, step)
+    with on_stream(light.device):
+        list(map(encode, starts) if light.is_cuda else each(encode, starts))
     return words.view(torch.uint8), decoded
 
 
 @functools.cache
 def _tables(codec: str, device: str) -> Any:
-    tables = _KERNELS[codec].Tables()
-    for name, values in _TABLES[codec].items():
+    tables = _CODECS[codec][0].Tables()
+    for name, values in _CODECS[codec][1].items():
         setattr(tables, name, wp.array(values, dtype=float if values.dtype == np.float32 else int, device=device))
     return tables
