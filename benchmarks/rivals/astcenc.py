@@ -59,7 +59,7 @@ class Astc:
 
 
 def astc(block: tuple[int, int], quality: float, extra: str) -> Astc:
-    """Returns the codec of the HDR profile for blocks of one of `hdr_blocks.ASTC_BLOCKS` texels, one for equal settings.
+    """Returns the HDR codec for blocks of one of `hdr_blocks.ASTC_BLOCKS` texels; equal settings share it.
 
     `quality` is the effort of the encoder, 0 (fastest) to 100 (exhaustive), and `extra` names the extra of wlm that
     installs it.
