@@ -124,7 +124,7 @@ class _ShaderBench(Bench):
         self.note(f"decoding {name}")
         model = random_sheet(self._side, np.array(_HOURS), 0, Profile.load(name))
         decoder = fast_decoder(model, self.device)
-        (ours,) = self.time_rows([(self.row("ours", name, f"8 bits, {self.mode}"), self.replay(decoder.decode))])
+        (ours,) = self.time_rows([(self.row("ours", name, f"RGB9E5, {self.mode}"), self.replay(decoder.decode))])
         made = sheet_bundle(Sheet(), model, name, "0" * 16, self.device)
         rows = [ours]
         for language, option, draw in [
@@ -167,7 +167,7 @@ class _ShaderBench(Bench):
         self.note("decoding a tile in Chromium")
         sheet, scene = random_sheet(TILE, np.array(_HOURS), 0, Profile.load("M")), f"a tile, {TILE} x {TILE}"
         decoder = fast_decoder(sheet, self.device)
-        (ours,) = self.time_rows([(self.row("ours", "M", f"8 bits, {self.mode}", scene=scene), decoder.decode)])
+        (ours,) = self.time_rows([(self.row("ours", "M", f"RGB9E5, {self.mode}", scene=scene), decoder.decode)])
         try:
             duration = page_time(LightmapModel("tile", "0" * 16, sheet.profile, {LIGHT: sheet}), self._repeats)
         except Exception as error:  # whatever a browser says

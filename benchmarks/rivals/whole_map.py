@@ -152,7 +152,7 @@ def _tile_decoders(model: SheetModel, device: str) -> list[RuntimeDecoder]:
     """Makes the fastest decoder to RGB9E5 of each kind of tile that a sheet has; constant tiles need none."""
     decoders: list[RuntimeDecoder] = []
     if (model.kind == TileKind.DYNAMIC).any():
-        decoders.append(fast_decoder(model, device, shared=True))
+        decoders.append(fast_decoder(model, device))
     if (model.kind == TileKind.FRAMES).any():
-        decoders.append(FrameDecoder(model, device, shared=True))
+        decoders.append(FrameDecoder(model, device))
     return decoders

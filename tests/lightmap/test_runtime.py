@@ -1,20 +1,30 @@
-"""The runtime decoders, against the decoder on the host and the float64 path."""
+"""The runtime decoders, against the float64 path."""
 
 import numpy as np
 import pytest
 import warp as wp
-from builders.lightmap_codes import shares_of
 from builders.synthetic import random_sheet
 
-from benchmarks.lightmap_exact import bound64, colour_tile64
+from benchmarks.lightmap_exact import bound64, decode_tile64
 from wlm import interop
 from wlm.formats.shared_exponent import LARGEST, pack_rgb9e5, unpack_rgb9e5
-from wlm.lightmap.decode import SheetDecoder
-from wlm.lightmap.runtime import ExactDecoder, MatrixDecoder, fast_decoder
+from wlm.lightmap.model import SheetModel
+from wlm.lightmap.runtime import ExactDecoder, FrameDecoder, MatrixDecoder, RuntimeDecoder, fast_decoder
 from wlm_kernels.shared_exponent import pack_rgb9e5 as pack_kernel
 from wlm_kernels.shared_exponent import unpack_rgb9e5 as unpack_kernel
 
 KINDS = (3, 4, 3, 1, 0, 3)
+
+
+def _check(decoder: RuntimeDecoder, model: SheetModel, time: float, most: float) -> None:
+    """Compares with the float64 path: half a step of RGB9E5, and a share of the tile's bound in gamma space."""
+    decoder.set_time(time)
+    decoder.decode()
+    gamma = model.profile.gamma
+    for number, found in zip(decoder.numbers.tolist(), decoder.numpy(), strict=True):
+        light, bound = decode_tile64(model, number, time), bound64(model, number, time)
+        allowed = (light ** (1.0 / gamma) + most * bound) ** gamma - light + light.max(-1, keepdims=True) / 500.0
+        assert (np.abs(found - light) <= allowed).all()
 
 
 @pytest.mark.parametrize(
@@ -23,49 +33,28 @@ KINDS = (3, 4, 3, 1, 0, 3)
 )
 def test_tiles_decode_at_any_time(device, hidden, gelu):
     model = random_sheet(KINDS, hidden=hidden, gelu=gelu)
-    exact = ExactDecoder(model, device)
-    assert exact.numbers.tolist() == [0, 2, 5]
-    for time in (None, 13.0, 21.7, 3.1):
-        if time is not None:
-            exact.set_time(time)
-        exact.decode()
-        # Between stored times the two are mixed after each was rounded, in steps of its own range.
-        stored, at = time in (None, 13.0), model.times[0] if time is None else time
-        shares = shares_of(model, exact.numbers, at)
-        assert np.abs(exact.numpy()[..., :3] - 255.0 * shares).max() < (0.51 if stored else 3.51)
-        np.testing.assert_allclose(exact.bounds, [bound64(model, number, at) for number in exact.numbers], rtol=1e-6)
+    exact, frames = ExactDecoder(model, device), FrameDecoder(model, device)
+    assert exact.numbers.tolist() == [0, 2, 5] and frames.numbers.tolist() == [1]
+    for decoder in (exact, frames):
+        for time in (model.times[0], 13.0, 21.7, 3.1):
+            _check(decoder, model, time, 1e-5)
 
 
 @pytest.mark.parametrize(("gelu", "most"), [("exact", 1e-4), ("tanh", 2e-2), ("fast", 2e-2)])
 def test_a_cheaper_gelu_stays_close(gelu, most, device):
     model = random_sheet((3,), columns=1)
-    exact = ExactDecoder(model, device, gelu)
-    exact.set_time(7.5)
-    exact.decode()
-    share = np.minimum(colour_tile64(model, 0, 7.5) / exact.bounds[0], 1.0)
-    assert np.abs(exact.numpy()[0, ..., :3] / 255.0 - share).max() < 0.5 / 255.0 + most
+    _check(ExactDecoder(model, device, gelu), model, 7.5, most)
 
 
-@pytest.mark.parametrize("shared", [False, True])
 @pytest.mark.parametrize(("hidden", "resolution"), [(16, 8), (48, 128), (64, 40)])
-def test_matrix_units_are_close(hidden, resolution, shared, device):
+def test_matrix_units_are_close(hidden, resolution, device):
     if device == "cpu":
         pytest.skip("a CPU has none")
     model = random_sheet(KINDS, hidden=hidden, gelu="tanh", uvt_resolution=resolution)
-    matrix, exact, gamma = MatrixDecoder(model, device, shared), SheetDecoder(model, device), model.profile.gamma
+    matrix = MatrixDecoder(model, device)
     assert matrix.numbers.tolist() == [0, 2, 5]
     for time in (13.0, 21.7):
-        matrix.set_time(time)
-        matrix.decode()
-        light, bounds = exact.tiles([0, 2, 5], time), matrix.bounds[:, None, None, None]
-        shares, found = np.minimum(light ** (1.0 / gamma) / bounds, 1.0), matrix.numpy()[..., :3]
-        # Half floats: some thousandths of an activation.
-        if shared:
-            steps = ((shares + 3.0 / 255.0) ** gamma - shares**gamma) * bounds**gamma
-            assert (np.abs(found - light) <= steps + light.max(-1, keepdims=True) / 500.0).all()
-        else:
-            off = np.abs(found - 255.0 * shares)
-            assert off.max() <= 3.0 and off.mean() < 0.3
+        _check(matrix, model, time, 3.0 / 255.0)  # half floats: some thousandths of an activation
 
 
 def test_a_captured_decode_repeats(device):

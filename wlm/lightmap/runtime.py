@@ -1,4 +1,4 @@
-"""Decodes to 32 bits per texel at run time: all data stays on the device, and a decode only launches kernels.
+"""Decodes whole tiles to RGB9E5 at run time: all data stays on the device, and a decode only launches kernels.
 
 `wlm.lightmap.Decoder` returns arrays on the host; the decoders of this module are for a renderer's loop. Each decodes
 the tiles of one kind of one sheet, without filling gaps between charts: an `ExactDecoder`, on CUDA a `MatrixDecoder`,
@@ -7,42 +7,37 @@ and a `FrameDecoder`. `wlm.lightmap.VirtualTexture` fills gaps, adds light group
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import warp as wp
 
 from wlm.errors import WlmError
 from wlm.formats.shared_exponent import unpack_rgb9e5
 from wlm.lightmap.decode import device_of, gelu_of
-from wlm.lightmap.encodings.base import inverse_of, rgba
 from wlm.lightmap.encodings.frames import FrameTiles
 from wlm.lightmap.encodings.maps import MapTiles, split_networks
 from wlm.lightmap.model import SheetModel
 from wlm.lightmap.tiles import TILE
 from wlm_kernels.lightmap import decode as decode_kernels
-from wlm_kernels.lightmap import matrix_decode, output
+from wlm_kernels.lightmap import matrix_decode
+from wlm_kernels.shared_exponent import pack_mean
 
 
 class RuntimeDecoder:
     """Base class: decodes all tiles of one kind on a device at a time that `set_time` chooses.
 
-    `decode` writes `out`, `wp.array` uint32 [n, 128, 128], in the order of the tiles' `numbers`: 8-bit RGBA with R in
-    the lowest byte and alpha 255; or RGB9E5.
+    `decode` writes `out`, `wp.array` uint32 [n, 128, 128], in the order of the tiles' `numbers`: linear radiance as
+    RGB9E5.
     """
 
-    _tiles: MapTiles | FrameTiles
-
-    def __init__(self, model: SheetModel, device: str, shared: bool) -> None:
-        """Allocates the output: RGB9E5 if `shared`, else 8-bit RGBA. The time is initially the first stored one."""
-        self.model, self.device, self.shared = model, device, shared
-        self.numbers = self._tiles.numbers
+    def __init__(self, model: SheetModel, tiles: MapTiles | FrameTiles, device: str) -> None:
+        """Allocates the output. The time is initially the first stored one."""
+        self.model, self.numbers, self.device = model, tiles.numbers, device
         self._rows = wp.array(np.arange(len(self.numbers), dtype=np.int32), dtype=int, device=device)
-        self.out = self._empty()
+        self.out = self._empty(wp.uint32)
         self.set_time(float(model.times[0]))
 
-    def _empty(self) -> wp.array:
-        return wp.zeros((len(self.numbers), TILE, TILE), dtype=wp.uint32, device=self.device)
+    def _empty(self, dtype: type) -> wp.array:
+        return wp.zeros((len(self.numbers), TILE, TILE), dtype=dtype, device=self.device)
 
     def set_time(self, time: float) -> None:
         """Sets the time of the following decodes, in the unit of the set's times, stored or between; see
@@ -60,39 +55,26 @@ class RuntimeDecoder:
         raise NotImplementedError
 
     def numpy(self) -> np.ndarray:
-        """Returns the decoded tiles: RGBA, uint8 [n, 128, 128, 4]; for RGB9E5 radiance, float32 [n, 128, 128, 3]."""
-        return unpack_rgb9e5(self.out.numpy()) if self.shared else rgba(self.out)
-
-    @property
-    def bounds(self) -> np.ndarray:
-        """Bound of each tile's 8-bit colours, float32 [n]: radiance = (byte / 255 * bound) ** gamma."""
-        return self._tiles.bounds(self._time).copy()
+        """Returns the radiance of the decoded tiles, float32 [n, 128, 128, 3]."""
+        return unpack_rgb9e5(self.out.numpy())
 
 
 class _MapDecoder(RuntimeDecoder):
     """Base class of the decoders of dynamic tiles."""
 
-    def __init__(
-        self,
-        model: SheetModel,
-        device: str = "cpu",
-        gelu: str | None = None,
-        shared: bool = False,
-    ) -> None:
-        """Uploads the dynamic tiles and allocates all buffers; the time is initially the first stored one.
-
-        `gelu` is a variant to use instead of the model's, see `wlm_kernels.mlp`; with `shared`, texels are linear
-        radiance as RGB9E5 instead of 8-bit colour relative to `bounds`.
-        """
-        device, self.gelu = device_of(device), gelu_of(model, gelu)
-        self._tiles = MapTiles(model, device, self.gelu)
+    def __init__(self, model: SheetModel, device: str = "cpu", gelu: str | None = None) -> None:
+        """Uploads the dynamic tiles and allocates all buffers; the time is initially the first stored one. `gelu` is a
+        variant to use instead of the model's, see `wlm_kernels.mlp`."""
+        device = device_of(device)
+        self._tiles = MapTiles(model, device, gelu_of(model, gelu))
         self._states: list[decode_kernels.TimeState | None] = [None, None]
-        super().__init__(model, device, shared)
+        super().__init__(model, self._tiles, device)
 
     def set_time(self, time: float) -> None:
-        self._time, self._reads = time, self.model.axis.reads(time)
+        self._reads = self.model.axis.reads(time)
         for i, (stamp, _) in enumerate(self._reads):
             self._states[i] = self._tiles.state(stamp, self._states[i])
+        self._share = self._reads[1][1] if len(self._reads) == 2 else 0.0
 
 
 class MatrixDecoder(_MapDecoder):
@@ -101,75 +83,58 @@ class MatrixDecoder(_MapDecoder):
     A decode is one launch, also between two stored times.
     """
 
-    def __init__(self, model: SheetModel, device: str = "cuda", shared: bool = False) -> None:
+    def __init__(self, model: SheetModel, device: str = "cuda") -> None:
         """Uploads the dynamic tiles of a sheet; for the arguments see `ExactDecoder`."""
         name, profile = device_of(device), model.profile
         if name == "cpu":
             raise WlmError("device: expected cuda for MatrixDecoder, got cpu")
         if profile.hidden % 16:
             raise WlmError(f"model: expected networks whose hidden width is a multiple of 16, got {profile.hidden}")
-        super().__init__(model, name, "fast", shared)
-        self._kernels = matrix_decode.matrix_kernels(profile.hidden, profile.uvt_resolution, shared)
+        super().__init__(model, name, "fast")
+        self._kernels = matrix_decode.matrix_kernels(profile.hidden, profile.uvt_resolution)
         packed = matrix_decode.pack_networks(*split_networks(model.net.astype(np.float32), profile.hidden))
         self._packed = wp.array(packed, dtype=wp.uint32, device=self.device)
 
     def decode(self) -> None:
         (stored, hidden, _), states = self._tiles.arguments, self._states[: len(self._reads)]
-        share = self._reads[1][1] if len(states) == 2 else 0.0
-        self._kernels.decode(stored, self._packed, hidden, states, share, self._rows, self.out)
+        self._kernels.decode(stored, self._packed, hidden, states, self._share, self._rows, self.out)
 
 
 class ExactDecoder(_MapDecoder):
-    """Plain decoder of dynamic tiles: a thread decodes a texel, in the training's order of operations.
+    """Plain decoder of dynamic tiles: a thread decodes a texel, in the training's order of operations."""
 
-    Between two stored times, a last kernel interpolates the results of both.
-    """
-
-    def __init__(self, *arguments: Any, **options: Any) -> None:
-        super().__init__(*arguments, **options)
-        self._early, self._late = self._empty(), self._empty()
+    def __init__(self, model: SheetModel, device: str = "cpu", gelu: str | None = None) -> None:
+        super().__init__(model, device, gelu)
+        self._light = self._empty(wp.vec3), self._empty(wp.vec3)
 
     def decode(self) -> None:
-        early, late = self._states
-        if len(self._reads) == 1:
-            self._launch(early, self.out)
-            return
-        self._launch(early, self._early)
-        self._launch(late, self._late)
-        share, arrays = self._reads[1][1], (self._early, self._late, self.out)
-        if self.shared:
-            *both, out = (array.flatten() for array in arrays)
-            output.blend_shared(*both, share, out)
-        else:
-            *both, out = (array.reshape((len(self.numbers), -1)) for array in arrays)
-            output.blend(*both, early.inverse_peak, late.inverse_peak, share, self.model.profile.gamma, out)
-
-    def _launch(self, state: decode_kernels.TimeState, out: wp.array) -> None:
-        self._tiles.launch(state, self._rows, 1 + self.shared, out)
+        for i in range(len(self._reads)):
+            self._tiles.launch(self._states[i], self._rows, self._light[i])
+        pack_mean(*self._light, self._share, self.out)
 
 
 class FrameDecoder(RuntimeDecoder):
     """Decoder of tiles that are stored as frames: one thread reads one texel of one frame, or of two to interpolate."""
 
-    def __init__(self, model: SheetModel, device: str = "cpu", shared: bool = False) -> None:
+    def __init__(self, model: SheetModel, device: str = "cpu") -> None:
         """Uploads the frames of a sheet and allocates all buffers; for the arguments see `ExactDecoder`."""
         device = device_of(device)
         self._tiles = FrameTiles(model, device)
-        self._inverse = wp.empty(len(self._tiles.numbers), dtype=float, device=device)
-        super().__init__(model, device, shared)
+        super().__init__(model, self._tiles, device)
+        self._light = self._empty(wp.vec3)
 
     def set_time(self, time: float) -> None:
         self._time = time
-        self._inverse.assign(inverse_of(self._tiles.bounds(time)))
 
     def decode(self) -> None:
-        self._tiles.decode(self._time, self._rows, self.out, None if self.shared else self._inverse)
+        self._tiles.decode(self._time, self._rows, self._light)
+        pack_mean(self._light, self._light, 0.0, self.out)
 
 
-def fast_decoder(model: SheetModel, device: str = "cpu", shared: bool = False) -> ExactDecoder | MatrixDecoder:
+def fast_decoder(model: SheetModel, device: str = "cpu") -> ExactDecoder | MatrixDecoder:
     """Makes the fastest decoder of dynamic tiles: on CUDA a `MatrixDecoder` if network width and GELU allow it."""
     device = device_of(device)
     tanh = device != "cpu" and model.profile.gelu == "tanh"
     if tanh and model.profile.hidden % 16 == 0:
-        return MatrixDecoder(model, device, shared)
-    return ExactDecoder(model, device, "fast" if tanh else None, shared=shared)
+        return MatrixDecoder(model, device)
+    return ExactDecoder(model, device, "fast" if tanh else None)

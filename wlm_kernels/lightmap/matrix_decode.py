@@ -4,7 +4,7 @@ A launch does everything: a block of threads decodes a strip of a tile, for whic
 hour, or at two between which it interpolates the radiance. A thread decodes the texels of a column. Activations and
 weights are half floats, and GELU is its tanh form with the GPU's tanh instruction.
 
-Read first: `exact_kernels` in `wlm_kernels/lightmap/decode.py`.
+Read first: `exact_kernel` in `wlm_kernels/lightmap/decode.py`.
 """
 
 import functools
@@ -14,9 +14,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from wlm_kernels.lightmap.decode import Stored, TimeState, bytes_over
+from wlm_kernels.lightmap.decode import Stored, TimeState
 from wlm_kernels.lightmap.features import INPUTS, MAP_INPUTS
-from wlm_kernels.lightmap.output import bound_of
 from wlm_kernels.native import native_source, on_cuda
 from wlm_kernels.shared_exponent import pack_rgb9e5
 
@@ -121,7 +120,7 @@ class MatrixKernels:
         tiles: wp.array,
         out: wp.array,
     ) -> None:
-        """Decodes n of N tiles to 32 bits per texel.
+        """Decodes n of N tiles to linear radiance.
 
         Args:
             stored: The N tiles.
@@ -130,8 +129,7 @@ class MatrixKernels:
             times: One time, or two between which radiance is interpolated linearly (neural-dynamic-gi, eq. 2).
             share: Weight of the second time, 0 to 1; 0 for one time.
             tiles: int [n], the tiles to decode.
-            out: uint32 [n, 128, 128], written: colour as 8-bit RGBA from the lowest byte, relative to the larger bound
-                of the times; or radiance as RGB9E5.
+            out: uint32 [n, 128, 128], written: RGB9E5.
         """
         wp.launch(
             self._one if len(times) == 1 else self._two,
@@ -144,13 +142,12 @@ class MatrixKernels:
 
 
 @functools.cache
-def matrix_kernels(hidden: int, resolution: int, shared: bool = False) -> MatrixKernels:
+def matrix_kernels(hidden: int, resolution: int) -> MatrixKernels:
     """Builds (once) the decoder for one shape of tiles.
 
     Args:
         hidden: H, width of the hidden layers, a multiple of 16.
         resolution: Size of F_uvt along u and v.
-        shared: Whether to write RGB9E5 instead of 8-bit RGBA.
 
     Raises:
         ValueError: The width is not a multiple of 16.
@@ -158,7 +155,7 @@ def matrix_kernels(hidden: int, resolution: int, shared: bool = False) -> Matrix
     if hidden % _STEP or hidden < _STEP:
         raise ValueError(f"hidden: expected a width that is a multiple of {_STEP} units, got {hidden}")
     rows = tuple(_rows(hidden, resolution, hours) for hours in (1, 2))
-    return MatrixKernels(*(_decode_kernel(hidden, resolution, shared, 1 + i, rows[i]) for i in range(2)), rows)
+    return MatrixKernels(*(_decode_kernel(hidden, resolution, 1 + i, rows[i]) for i in range(2)), rows)
 
 
 def _native(*names: str, **constants: int) -> str:
@@ -205,9 +202,8 @@ def _rows(width: int, resolution: int, hours: int) -> int:
     return _ROWS if own + volume <= _SHARED else _ROWS // 2
 
 
-def _decode_kernel(width: int, resolution: int, shared: bool, hours: int, rows: int) -> wp.Kernel:
+def _decode_kernel(width: int, resolution: int, hours: int, rows: int) -> wp.Kernel:
     vec_hidden, vec_result = wp.types.vector(width, float), wp.types.vector(12, float)
-    radiance = shared or hours == 2
     code = _native("matrix_network", "matrix_maps", "matrix_decode", H=width, R=resolution, ROWS=rows, HOURS=hours)
 
     @wp.func_native(on_cuda(code, "return wp::vec_t<12, float>();"))
@@ -243,7 +239,6 @@ def _decode_kernel(width: int, resolution: int, shared: bool, hours: int, rows: 
         column = x - lane + 8 * (lane % 4) + lane // 4
         shift, spread = early.shift[n], early.spread[n]
         early_scale, late_scale = early.scale[n], late.scale[n]
-        inverse = bound_of(wp.max(bound_of(early.inverse_peak[n]), bound_of(late.inverse_peak[n])))
         # Variables keep the loops rolled.
         parts = int(wp.static(rows // 4))
         count = int(wp.static(hours))
@@ -258,18 +253,11 @@ def _decode_kernel(width: int, resolution: int, shared: bool, hours: int, rows: 
                 for r in range(4):
                     answer = wp.vec3(y[3 * r], y[3 * r + 1], y[3 * r + 2])
                     light = wp.max(wp.cw_mul(shift + wp.cw_mul(spread, answer), scale), wp.vec3())
-                    if wp.static(radiance):
-                        light = powers(light, early.gamma)
+                    light = powers(light, early.gamma)
                     for c in range(3):
                         total[3 * r + c] += weight * light[c]
             for r in range(4):
                 light = wp.vec3(total[3 * r], total[3 * r + 1], total[3 * r + 2])
-                if wp.static(shared):
-                    word = pack_rgb9e5(light)
-                else:
-                    if wp.static(radiance):
-                        light = powers(light, 1.0 / early.gamma)
-                    word = bytes_over(light, inverse)
-                out[i, strip * wp.static(rows) + 4 * part + r, column] = word
+                out[i, strip * wp.static(rows) + 4 * part + r, column] = pack_rgb9e5(light)
 
     return decode

@@ -9,7 +9,7 @@ From level `COARSE_LEVEL` on, texels are means of a table of `COARSE` x `COARSE`
 that a page of a whole map does not need its tiles. This table is itself decoded by the same kernel (`direct`). A page
 of the level below takes as many samples as `PARTS` others: it is decoded in as many parts, a quarter of its rows each.
 
-Read first: `exact_kernels` in `wlm_kernels/lightmap/decode.py`.
+Read first: `exact_kernel` in `wlm_kernels/lightmap/decode.py`.
 """
 
 import functools
