@@ -66,7 +66,7 @@ def _fitted(
     axis, _scatter = lines.axis_of(moments, _AXIS_ROUNDS)
     a, b = lines.extremes(texels, mask, moments, axis)
     for _round in range(_REFINED):
-        a, b = lines.ends_of(lines.sums_of(texels, mask, lines.nearest(texels, a, b, steps)), a, b)
+        a, b = lines.ends_of(lines.sums_of(texels, mask, lines.nearest(texels, mask, a, b, steps)), a, b)
     ends[2 * line] = a
     ends[2 * line + 1] = b
     return ends

@@ -77,7 +77,6 @@ class SixWay:
         lights: Sequence[Light],
         *,
         background: torch.Tensor | Sequence[float] | None = None,
-        rule: str = "squared",
         ramp: Ramp | None = None,
         albedo: Sequence[float] = (1.0, 1.0, 1.0),
     ) -> torch.Tensor:
@@ -87,7 +86,6 @@ class SixWay:
             lights: Any number of directional lights.
             background: Linear light behind the smoke, [H, W, 3] or one colour; None: only the smoke's light, to which
                 the background times the transparency must be added.
-            rule: Rule for the weights of the lightmaps, one of `wlm.smoke.camera.RULES`.
             ramp: Colour of the emission; None: grey.
             albedo: R, G, B, share of light that survives a scattering, 0 to 1.
 
@@ -105,7 +103,7 @@ class SixWay:
         image = torch.zeros((height, width, 3), dtype=torch.float32, device=self.lightmaps.device)
         for light in lights:
             irradiance = checked_colour("irradiance", light.irradiance)
-            share = weights(self.camera.axes @ np.asarray(light.toward, np.float64), rule)
+            share = weights(self.camera.axes @ np.asarray(light.toward, np.float64))
             grey = torch.einsum("c,chw->hw", torch.tensor(share).to(self.lightmaps), self.lightmaps)
             image += grey[..., None] * torch.tensor(irradiance * scattered).to(image)
         if self.emission is not None:
