@@ -14,7 +14,8 @@ import warp as wp
 
 from wlm_kernels import block_lines as lines
 
-wp.set_module_options({"enable_backward": False, "max_unroll": 1})
+# Without fused operations every device writes the same bytes.
+wp.set_module_options({"enable_backward": False, "max_unroll": 1, "fuse_fp": False})
 
 _POWER_ROUNDS = wp.constant(4)
 _AXIS_ROUNDS = wp.constant(8)
@@ -66,7 +67,7 @@ def _fitted(
     axis, _scatter = lines.axis_of(moments, _AXIS_ROUNDS)
     a, b = lines.extremes(texels, mask, moments, axis)
     for _round in range(_REFINED):
-        a, b = lines.ends_of(lines.sums_of(texels, mask, lines.nearest(texels, a, b, steps)), a, b)
+        a, b = lines.ends_of(lines.sums_of(texels, mask, lines.nearest(texels, mask, a, b, steps)), a, b)
     ends[2 * line] = a
     ends[2 * line + 1] = b
     return ends

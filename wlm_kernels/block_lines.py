@@ -169,11 +169,12 @@ def along(texels: Texels, texel: int, a: wp.vec3, b: wp.vec3) -> float:
 
 
 @wp.func
-def nearest(texels: Texels, a: wp.vec3, b: wp.vec3, steps: int) -> Numbers:
-    """Returns the place of each texel between two ends, rounded to a number of steps."""
+def nearest(texels: Texels, mask: int, a: wp.vec3, b: wp.vec3, steps: int) -> Numbers:
+    """Returns the places of the texels in `mask` between two ends, rounded to a number of steps."""
     places = Numbers()
     for i in range(TEXELS):
-        places[i] = wp.floor(along(texels, i, a, b) * float(steps) + 0.5) / float(steps)
+        if in_mask(mask, i):
+            places[i] = wp.floor(along(texels, i, a, b) * float(steps) + 0.5) / float(steps)
     return places
 
 
