@@ -11,7 +11,8 @@ import warp as wp
 
 from wlm_kernels import block_lines as lines
 
-wp.set_module_options({"enable_backward": False, "max_unroll": 1})
+# Without fused operations every device writes the same bytes.
+wp.set_module_options({"enable_backward": False, "max_unroll": 1, "fuse_fp": False})
 
 _AXIS_ROUNDS = wp.constant(5)
 _REFITTED = wp.constant(2)  # number of refits of the best block's ends to its weights

@@ -14,7 +14,8 @@ import warp as wp
 
 from wlm_kernels import block_lines as lines
 
-wp.set_module_options({"enable_backward": False, "max_unroll": 1})
+# Without fused operations every device writes the same bytes.
+wp.set_module_options({"enable_backward": False, "max_unroll": 1, "fuse_fp": False})
 
 _POWER_ROUNDS = wp.constant(4)
 _AXIS_ROUNDS = wp.constant(8)
