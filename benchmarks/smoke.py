@@ -50,7 +50,8 @@ from wlm.fluid.slabs import Slabs
 from wlm.fluid.volume import DensityVolume, gather
 from wlm.interop import stream, to_warp
 from wlm.metrics import psnr_from_mse
-from wlm.smoke.camera import Camera, weights
+from wlm.smoke.camera import RULES, Camera
+from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.march.six_way import Guide, bake, guide
 from wlm.smoke.scene import CameraSettings, Scene, load_scene, make_camera
 from wlm.smoke.shading import Light, PointLight
@@ -561,23 +562,18 @@ def six_rows(bench: SmokeBench) -> Iterator[Row]:
 
 
 def weight_rows(bench: SmokeBench) -> Iterator[Row]:
-    """Compares six lightmaps weighted for oblique lights, by each rule, with a ray march for each light, on a plume.
-
-    The weight of lightmap p under a light from w is w_p^2; |w_p|, the paper's eq. 5; or |w_p| over the sum of these.
-    """
+    """Compares six lightmaps weighted for oblique lights, by each rule, with a ray march for each light, on a plume."""
     bench.note("measuring the weights of six lightmaps")
     volume = make_plume(hot=False, extinction=_PLUME, device=bench.device)
     size = volume.voxel * np.array(volume.shape)
     camera = make_camera(CameraSettings(resolution=bench.sizes.plume), volume.origin, size)
     six = bake(volume, camera, step=_WEIGHT_STEP, estimate=False)
+    six = SixWay(six.lightmaps, None, camera=camera)
     lights = [tuple(map(float, toward)) for toward in _directions(_LIGHTS)]
     march = March(_WEIGHT_STEP, spacing=_WEIGHT_STEP / 2, jitter=0.0)
     exact = list(light_smoke(volume, camera, [Light(toward) for toward in lights], march).planes)
-    squared = weights(np.array(lights) @ camera.axes.T)
-    absolute = np.sqrt(squared)
-    rules = {"squared": squared, "absolute": absolute, "normalised": absolute / absolute.sum(1, keepdims=True)}
-    for rule, shares in rules.items():
-        weighted = list(torch.einsum("lc,chw->lhw", torch.tensor(shares).to(six.lightmaps), six.lightmaps))
+    for rule in RULES:
+        weighted = [six.shade([Light(toward)], rule=rule)[..., 0] for toward in lights]
         pairs = list(zip(weighted, exact, strict=True))
         bias = [float(w.double().mean() / e.double().mean()) - 1.0 for w, e in pairs]
         yield bench.row(

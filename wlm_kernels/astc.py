@@ -11,7 +11,8 @@ import warp as wp
 
 from wlm_kernels import block_lines as lines
 
-wp.set_module_options({"enable_backward": False, "max_unroll": 1})
+# Without fused operations every device writes the same bytes.
+wp.set_module_options({"enable_backward": False, "max_unroll": 1, "fuse_fp": False})
 
 _AXIS_ROUNDS = wp.constant(5)
 _REFITTED = wp.constant(2)  # number of refits of the best block's ends to its weights
@@ -26,7 +27,23 @@ _Wanted = wp.types.vector(length=6, dtype=float)
 
 @wp.struct
 class Tables:
-    """The tables of the format: `wlm.formats.astc.TABLES`, int."""
+    """The tables of `wlm.formats.astc.TABLES`, int.
+
+    Attributes:
+        modes: [M, 8], the ways to store a block: number of lines, endpoint mode, the block mode with the number of
+            lines; number of weights; then 1 or 3 and a number of bits, whose power of two it is multiplied by, for the
+            range of the weights and for that of the bytes.
+        shares, weight_codes: [M, 32], for the weights from the smallest: the second end's share in 64ths, and the
+            number that is stored.
+        rounded: [M, 5, 256], for each number of highest bits that are kept, and byte: the nearest byte of the range.
+        byte_codes: [M, 256], the number that is stored for a byte.
+        heads: [L, 3], for each layout of a line's ends: the shift from its fields to 12 bits; the header is the second
+            number plus the third times the number of the largest channel.
+        layouts: [L, 6, 7], for each byte of a layout: the sources of its highest bits, 16 times a field plus the bit
+            in it; how many they are; how many highest bits rounding keeps; the byte's own field, and its largest value.
+        groups: [243], the bits of five trits, by the trits as a number.
+        partitions: [P, 2], for each division of a block: the texels on the second line, a bit each, and its number.
+    """
 
     modes: wp.array2d[int]
     shares: wp.array2d[int]
@@ -66,10 +83,7 @@ def _light_of(place: int) -> float:
         bits = 3 * part
     elif part >= 1536:
         bits = 5 * part - 2048
-    bits = wp.min(((place >> 11) << 10) + (bits >> 3), 0x7BFF)
-    if bits < 1024:
-        return float(bits) / 16777216.0
-    return wp.cast((bits + (112 << 10)) << 13, float)
+    return lines.light_of(wp.min(((place >> 11) << 10) + (bits >> 3), 0x7BFF))
 
 
 @wp.func
@@ -343,7 +357,7 @@ def _encode(
                     if kind != _BASE_SCALE:
                         axis, _along = lines.axis_of(part, _AXIS_ROUNDS)
                     a, b = lines.extremes(texels, own, part, axis)
-                    shares = lines.nearest(texels, a, b, tables.modes[block.mode, 3] - 1)
+                    shares = lines.nearest(texels, own, a, b, tables.modes[block.mode, 3] - 1)
                 a, b = _fitted(lines.sums_of(texels, own, shares), a, b, kind)
                 block = _store(tables, block, line, a, b)
             block = _weighted(texels, tables, block)

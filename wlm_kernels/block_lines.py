@@ -55,6 +55,14 @@ class Sums:
 
 
 @wp.func
+def light_of(bits: int) -> float:
+    """Returns the value of a half float, 0 or more and finite, by its bits."""
+    if bits < 1024:
+        return float(bits) / 16777216.0
+    return wp.cast((bits + (112 << 10)) << 13, float)
+
+
+@wp.func
 def in_mask(mask: int, texel: int) -> bool:
     return ((mask >> texel) & 1) == 1
 
@@ -169,11 +177,12 @@ def along(texels: Texels, texel: int, a: wp.vec3, b: wp.vec3) -> float:
 
 
 @wp.func
-def nearest(texels: Texels, a: wp.vec3, b: wp.vec3, steps: int) -> Numbers:
-    """Returns the place of each texel between two ends, rounded to a number of steps."""
+def nearest(texels: Texels, mask: int, a: wp.vec3, b: wp.vec3, steps: int) -> Numbers:
+    """Returns the places of the texels in `mask` between two ends, rounded to a number of steps."""
     places = Numbers()
     for i in range(TEXELS):
-        places[i] = wp.floor(along(texels, i, a, b) * float(steps) + 0.5) / float(steps)
+        if in_mask(mask, i):
+            places[i] = wp.floor(along(texels, i, a, b) * float(steps) + 0.5) / float(steps)
     return places
 
 

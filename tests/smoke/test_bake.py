@@ -12,7 +12,7 @@ from reference.single_light import lit
 from benchmarks.path_tracer import PathTracer
 from demos.plume import make_plume
 from wlm.fluid.volume import DensityVolume, from_array
-from wlm.smoke.camera import DIRECTIONS, VECTORS, Camera, weights
+from wlm.smoke.camera import DIRECTIONS, RULES, VECTORS, Camera, weights
 from wlm.smoke.lightmaps import axis_faults
 from wlm.smoke.march.six_way import bake
 
@@ -67,10 +67,14 @@ def test_shading_approximates_oblique_lights(device: str):
     turn = np.linalg.qr(np.random.default_rng(4).normal(size=(3, 3)))[0]
     ways = np.array(corners) @ turn / math.sqrt(1 + golden**2)
     expected = torch.stack([lit(volume, camera, camera.axes.T @ way, step=0.7) for way in ways]).double().cpu()
-    made = [torch.einsum("lc,chw->lhw", torch.tensor(each), six) for each in (weights(ways), np.sqrt(weights(ways)))]
-    ratio = [float(result.sum() / expected.sum()) for result in made]
-    error = [float((result - expected).square().mean().sqrt()) for result in made]
-    assert 0.9 < ratio[0] < 1.05 and 1.3 < ratio[1] < 1.65 and error[0] < 0.6 * error[1]
+    ratio, error = {}, {}
+    for rule in RULES:
+        result = torch.einsum("lc,chw->lhw", torch.tensor(weights(ways, rule)), six)
+        ratio[rule] = float(result.sum() / expected.sum())
+        error[rule] = float((result - expected).square().mean().sqrt())
+    assert 0.9 < ratio["squared"] < 1.05 and 0.9 < ratio["normalised"] < 1.05
+    assert 1.3 < ratio["absolute"] < 1.65
+    assert error["squared"] < 0.6 * error["absolute"]
 
 
 def test_supersampling(device: str):

@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+import pytest
 import torch
 
 from wlm.smoke.camera import VECTORS, Camera
@@ -29,12 +30,15 @@ def test_one_light_along_each_axis(device: str):
         np.testing.assert_allclose(result.cpu(), expected.cpu(), atol=1e-6)
 
 
-def test_an_oblique_light(device: str):
-    """A light from the left and the back by the squares of its components."""
+@pytest.mark.parametrize(
+    ("rule", "share"), [("squared", (9 / 25, 16 / 25)), ("absolute", (3 / 5, 4 / 5)), ("normalised", (3 / 7, 4 / 7))]
+)
+def test_rules(device: str, rule: str, share: tuple):
+    """A light from the left and the back by each rule; eq. 5 is "absolute"."""
     six = _six(device)
     toward = tuple(six.camera.axes.T @ np.array([-3.0, 0.0, -4.0]))
-    result = six.shade([Light(toward, FULL)])[..., 0]
-    np.testing.assert_allclose(result.cpu(), ((9 * six["left"] + 16 * six["back"]) / 25).cpu(), atol=1e-6)
+    result = six.shade([Light(toward, FULL)], rule=rule)[..., 0]
+    np.testing.assert_allclose(result.cpu(), (share[0] * six["left"] + share[1] * six["back"]).cpu(), atol=1e-6)
 
 
 def test_lights_add_up(device: str):

@@ -132,9 +132,10 @@ def test_without_obstacles_it_is_smoke_over_a_colour(device):
     lights = [light, Light((1.0, 2.0, -1.0), (3.0, 4.0, 5.0))]
     for given in (lights, lights[:1], []):
         for colours in (ramp, None):
-            expected = six.shade(given, background=(0.2, 0.4, 0.6), ramp=colours)
-            found = picture(six, given, background=(0.2, 0.4, 0.6), ramp=colours)
-            torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6)
+            for rule in ("squared", "absolute"):
+                expected = six.shade(given, background=(0.2, 0.4, 0.6), ramp=colours, rule=rule)
+                found = picture(six, given, background=(0.2, 0.4, 0.6), ramp=colours, rule=rule)
+                torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6)
 
 
 def test_a_contact_sheet(tmp_path):

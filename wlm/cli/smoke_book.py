@@ -80,6 +80,12 @@ def shade(
     light: Lights = None,
     background: Background = None,
     white: White = 1.0,
+    rule: Annotated[
+        Literal["squared", "absolute", "normalised"],
+        typer.Option(
+            help="Weight of a map by the cosine c of its axis and the light: c^2, c, or c over the sum of all c."
+        ),
+    ] = "squared",
     textures: _With = None,
     cells: _Cells = None,
     source_layout: _From = None,
@@ -112,6 +118,7 @@ def shade(
             looks = shot.looks or plain
             given = lights or [settings.light() for settings in looks.lights]
             extra = {"albedo": looks.albedo, "ramp": looks.ramp, "obstacles": looks.obstacles, "time": looks.time}
+            extra["rule"] = rule
             shaded = picture(shot.six, given, background=looks.background if behind is None else behind, **extra)
             pictures.append(to_bytes(shaded, white))
             path = file(shot.number)

@@ -71,35 +71,26 @@ def _values(levels: int, width: int) -> list[int]:
     return values
 
 
-def _modes() -> np.ndarray:
-    rows = []
-    for lines, kind, weights, levels in _MODES:
+def _modes() -> dict[str, np.ndarray]:
+    """Returns the tables with a row for each mode."""
+    rows, wanted = len(_MODES), np.arange(256)[:, None]
+    modes, shares, weight_codes = (np.zeros((rows, columns), np.int32) for columns in (8, 32, 32))
+    rounded, byte_codes = np.zeros((rows, 5, 256), np.int32), np.zeros((rows, 256), np.int32)
+    for row, (lines, kind, weights, levels) in enumerate(_MODES):
         fine, rho = divmod(_WEIGHTS.index(weights), 6)
         # The grid of weights has 4 columns (bits 7 and 8: 0) and 4 rows (bits 5 and 6: 2).
         block_mode = rho + 2 >> 1 | (rho & 1) << 4 | 2 << 5 | fine << 9 | lines - 1 << 11
-        rows.append((lines, kind, block_mode, weights, *_range(weights), *_range(levels)))
-    return np.array(rows, np.int32)
-
-
-def _weights() -> tuple[np.ndarray, np.ndarray]:
-    shares, codes = np.zeros((2, len(_MODES), 32), np.int32)
-    for row, (_, _, weights, _) in enumerate(_MODES):
+        modes[row] = lines, kind, block_mode, weights, *_range(weights), *_range(levels)
         values = np.array(_values(weights, 6))
-        codes[row, :weights] = order = np.argsort(values)
+        weight_codes[row, :weights] = order = np.argsort(values)
         shares[row, :weights] = values[order] + (values[order] > 32)
-    return shares, codes
-
-
-def _bytes() -> tuple[np.ndarray, np.ndarray]:
-    rounded, codes = np.zeros((len(_MODES), 5, 256), np.int32), np.zeros((len(_MODES), 256), np.int32)
-    wanted = np.arange(256)[:, None]
-    for row, (_, _, _, levels) in enumerate(_MODES):
         values = np.array(_values(levels, 8))
-        codes[row, values] = np.arange(levels)
+        byte_codes[row, values] = np.arange(levels)
         for kept in range(5):
             far = np.abs(values - wanted) + 1000 * (values >> 8 - kept != wanted >> 8 - kept)
             rounded[row, kept] = values[far.argmin(1)]
-    return rounded, codes
+    names = ("modes", "shares", "weight_codes", "rounded", "byte_codes")
+    return dict(zip(names, (modes, shares, weight_codes, rounded, byte_codes), strict=True))
 
 
 def _layouts() -> np.ndarray:
@@ -164,21 +155,10 @@ def _partitions() -> np.ndarray:
     return np.array([*found.items()], np.int32)
 
 
-def _tables() -> dict[str, np.ndarray]:
-    shares, weight_codes = _weights()
-    rounded, byte_codes = _bytes()
-    return {
-        "modes": _modes(),
-        "shares": shares,
-        "weight_codes": weight_codes,
-        "rounded": rounded,
-        "byte_codes": byte_codes,
-        "heads": np.array([layout[1:4] for layout in _LAYOUTS], np.int32),
-        "layouts": _layouts(),
-        "groups": _groups(),
-        "partitions": _partitions(),
-    }
-
-
-TABLES = _tables()
+TABLES = _modes() | {
+    "heads": np.array([layout[1:4] for layout in _LAYOUTS], np.int32),
+    "layouts": _layouts(),
+    "groups": _groups(),
+    "partitions": _partitions(),
+}
 """The tables of `wlm_kernels.astc.Tables`, int32, by name."""

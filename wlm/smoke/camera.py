@@ -35,6 +35,10 @@ LAYOUTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
 }
 """Channels R, G, B, A of an engine's two textures. O3DE reads opacity from a third texture, which may be this alpha."""
 
+RULES = ("squared", "absolute", "normalised")
+"""Rules for the weight of lightmap p under a light from w: w_p^2; |w_p|, the paper's eq. 5; |w_p| / (|w_x| + |w_y| +
+|w_z|)."""
+
 _SHORTEST = 1e-12
 _MARGIN = 1.05  # image height over box height, so that no smoke touches the edge
 
@@ -48,18 +52,23 @@ def unit(vector: Sequence[float] | np.ndarray, name: str = "toward") -> np.ndarr
     return vector / length
 
 
-def weights(toward: Sequence[float] | np.ndarray) -> np.ndarray:
+def weights(toward: Sequence[float] | np.ndarray, rule: str = "squared") -> np.ndarray:
     """Returns the weights of the lightmaps, float64 [..., 6] in the order of `DIRECTIONS`, under lights from directions
-    [..., 3] in the camera's axes, of any length except 0: the squares of the unit direction's components.
+    [..., 3] in the camera's axes, of any length except 0, by one of `RULES`.
 
-    The paper's weights (eq. 5) are the absolute components; their sum is up to 1.73, for a light along a diagonal.
-    Their squares, which engines use, always sum to 1.
+    The paper's weights (eq. 5) are the absolute components of the unit direction; their sum is up to 1.73, for a light
+    along a diagonal. Their squares, which engines use, always sum to 1.
     """
+    if rule not in RULES:
+        raise ValueError(f"rule: expected one of {', '.join(RULES)}, got {rule!r}")
     toward = np.asarray(toward, np.float64)
     length = np.linalg.norm(toward, axis=-1, keepdims=True)
     if toward.shape[-1:] != (3,) or not (np.isfinite(length) & (length > _SHORTEST)).all():
         raise ValueError(f"toward: expected finite directions [..., 3], none of them 0, got {toward.tolist()}")
-    return np.maximum((toward / length) @ VECTORS.T, 0.0) ** 2
+    along = np.maximum((toward / length) @ VECTORS.T, 0.0)
+    if rule == "squared":
+        return along**2
+    return along / along.sum(-1, keepdims=True) if rule == "normalised" else along
 
 
 @dataclass(frozen=True)

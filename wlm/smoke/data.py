@@ -162,10 +162,13 @@ class Frames:
             volume = replace(volume, warnings=(*volume.warnings, warning))
         return volume
 
-    def volumes(self, progress: OnProgress | None = None) -> Iterator[tuple[int, DensityVolume]]:
+    def volumes(
+        self, numbers: Sequence[int] | None = None, progress: OnProgress | None = None
+    ) -> Iterator[tuple[int, DensityVolume]]:
         """Yields the number and the volume of each frame; calls `progress` when the caller has processed a frame."""
-        meter = Meter(progress, "frames", len(self.numbers))
-        for done, number in enumerate(self.numbers, 1):
+        numbers = self.numbers if numbers is None else numbers
+        meter = Meter(progress, "frames", len(numbers))
+        for done, number in enumerate(numbers, 1):
             yield number, self.load(number)
             meter.report(done)
 

@@ -77,6 +77,7 @@ class SixWay:
         lights: Sequence[Light],
         *,
         background: torch.Tensor | Sequence[float] | None = None,
+        rule: str = "squared",
         ramp: Ramp | None = None,
         albedo: Sequence[float] = (1.0, 1.0, 1.0),
     ) -> torch.Tensor:
@@ -86,6 +87,7 @@ class SixWay:
             lights: Any number of directional lights.
             background: Linear light behind the smoke, [H, W, 3] or one colour; None: only the smoke's light, to which
                 the background times the transparency must be added.
+            rule: Rule for the weights of the lightmaps, one of `wlm.smoke.camera.RULES`.
             ramp: Colour of the emission; None: grey.
             albedo: R, G, B, share of light that survives a scattering, 0 to 1.
 
@@ -103,7 +105,7 @@ class SixWay:
         image = torch.zeros((height, width, 3), dtype=torch.float32, device=self.lightmaps.device)
         for light in lights:
             irradiance = checked_colour("irradiance", light.irradiance)
-            share = weights(self.camera.axes @ np.asarray(light.toward, np.float64))
+            share = weights(self.camera.axes @ np.asarray(light.toward, np.float64), rule)
             grey = torch.einsum("c,chw->hw", torch.tensor(share).to(self.lightmaps), self.lightmaps)
             image += grey[..., None] * torch.tensor(irradiance * scattered).to(image)
         if self.emission is not None:

@@ -49,12 +49,14 @@ class Drawing:
         background: Sequence[float] = (0.0, 0.0, 0.0),
         ramp: Ramp | None = None,
         obstacles: Sequence[ObstacleSettings] = (),
+        rule: str = "squared",
         device: str = "cpu",
     ) -> None:
         """Allocates the buffers for a view under any number of lights.
 
         `albedo`, R, G, B, is applied to light scattered once; `background` is a linear colour; `ramp` is the colour of
-        the emission, None for grey; obstacles are drawn and cast shadows on the smoke's surface.
+        the emission, None for grey; obstacles are drawn and cast shadows on the smoke's surface. `rule` is how the
+        lightmaps are weighted by a light's direction, one of `wlm.smoke.camera.RULES`.
         """
         self._camera, self._obstacles, self._device = camera, tuple(obstacles), device
         self._albedo, self._background = tuple(map(float, checked_albedo(albedo))), tuple(map(float, background))
@@ -65,7 +67,7 @@ class Drawing:
             if isinstance(light, Light):
                 colours.append(checked_colour("irradiance", light.irradiance))
                 toward.append(unit(light.toward))
-                shares.append(weights(camera.axes @ toward[-1]))
+                shares.append(weights(camera.axes @ toward[-1], rule))
             else:
                 colours.append(checked_colour("intensity", light.intensity))
                 toward.append(np.zeros(3))
@@ -185,6 +187,7 @@ def picture(
     ramp: Ramp | None = None,
     obstacles: Sequence[ObstacleSettings] = (),
     time: float = 0.0,
+    rule: str = "squared",
 ) -> torch.Tensor:
     """Draws lit smoke and a scene's obstacles, as one call of `Drawing` does, which explains the other options: float32
     [H, W, 3], linear.
@@ -196,7 +199,7 @@ def picture(
     lit = smoke.lit if isinstance(smoke, ScatteredSmoke) else smoke
     if lit.camera is None:
         raise ValueError("smoke: expected lightmaps or lit smoke with a camera, found none")
-    options = {"albedo": albedo, "background": background, "ramp": ramp, "obstacles": obstacles}
+    options = {"albedo": albedo, "background": background, "ramp": ramp, "obstacles": obstacles, "rule": rule}
     device = device_name(lit.transparency.device if lit.transparency is not None else lit.lightmaps.device)
     if obstacles and not isinstance(smoke, SixWay):
         raise ValueError("obstacles: expected none with lit smoke, which a Drawing draws among obstacles")
