@@ -4,7 +4,7 @@ For a light at infinity the lattice has lines that run towards the light. The op
 nodes of a line is marched once; sums along the line from both of its ends are the depths to the light and to the
 opposite light. This takes as many samples as there are nodes, where a march from each node would take a line of
 samples per node. A lattice has one pair of opposite lights along its first axis, or two pairs along its first and
-second axes. The lattice of a point light follows the grid's axes, and each node marches to the light separately, since
+second axes, which share samples at the nodes (trapezoidal rule). The lattice of a point light follows the grid's axes, and each node marches to the light separately, since
 no two of its rays are parallel.
 
 Units and sampling are those of `march`.
@@ -36,12 +36,12 @@ voxels."""
 _MOST_MARCHING = 2**24  # largest number of nodes of a point light, each of which marches separately
 _AT_ONCE = wp.constant(8)  # nodes of a line that a thread sums at a time
 _LEAST_SPACING = 0.25  # voxels between nodes
-_DEEPEST = wp.constant(60000.0)  # largest optical depth between nodes, within the range of half floats
+_DEEPEST = wp.constant(60000.0)  # largest extinction, within the range of half floats
 _NEVER = wp.constant(1.0e30)
 _DARK = wp.constant(6.0)  # optical depth of an obstacle: a larger one would widen shadows between nodes
 _ROUNDING = 1e-6  # relative excess of a part over the step that is tolerated, so that rounding adds no part
 
-_Several = wp.types.vector(length=int(_AT_ONCE), dtype=float)
+_Several = wp.types.vector(length=int(_AT_ONCE) + 1, dtype=float)
 
 
 @wp.struct
@@ -99,75 +99,85 @@ def _on_line(pair: int, line: int, n: int, k: int) -> wp.vec4i:
 @wp.kernel(module="unique", module_options=OPTIONS)
 def _add_up(
     # in:
-    gaps: wp.array4d[wp.float16],
+    extinctions: wp.array3d[wp.float16],
     lattice: Lattice,
     solid: Solid,
+    share: float,
     # out:
     nodes: wp.array4d[wp.vec2],
 ):
-    """Sums optical depths from each node of a line to both of its ends; the light is beyond the last node."""
+    """Sums optical depths from each node of a line to both of its ends; the light is beyond the last node. The
+    extinction between two nodes is that of the first, and of the second by `share`."""
     pair, line, k = wp.tid()
     last = wp.where(pair == 0, nodes.shape[1], nodes.shape[2]) - 1
     if line >= wp.where(pair == 0, nodes.shape[2], nodes.shape[1]):
         return
+    gap = wp.where(pair == 0, lattice.gap[0], lattice.gap[1])
     # Nodes farther from the last node, and from the first one, are in the shadow of obstacles.
     lit = float(_NEVER)
     opposite = float(_NEVER)
     if solid.mesh != wp.uint64(0):
-        gap = wp.where(pair == 0, lattice.gap[0], lattice.gap[1])
         lit = _lit_way(solid, _on_line(pair, line, last, k), lattice, axis(lattice, pair)) / gap
         opposite = _lit_way(solid, _on_line(pair, line, 0, k), lattice, -axis(lattice, pair)) / gap
     # In double precision, since the depth ahead is a difference. Several nodes at a time, since loads wait for earlier
     # stores.
     ahead = wp.float64(0.0)
-    for n in range(last):
+    before = float(0.0)
+    for n in range(last + 1):
         q = _on_line(pair, line, n, k)
-        ahead += wp.float64(gaps[q[0], q[1], q[2], q[3]])
+        now = float(extinctions[q[1], q[2], q[3]])
+        if n > 0:
+            ahead += wp.float64(gap * wp.lerp(before, now, share))
+        before = now
     behind = wp.float64(0.0)
+    before = float(0.0)
     for begin in range(0, last + 1, _AT_ONCE):
         several = _Several()
-        for m in range(_AT_ONCE):
-            if begin + m < last:
+        for m in range(_AT_ONCE + 1):
+            if begin + m <= last:
                 q = _on_line(pair, line, begin + m, k)
-                several[m] = float(gaps[q[0], q[1], q[2], q[3]])
+                several[m] = float(extinctions[q[1], q[2], q[3]])
         for m in range(_AT_ONCE):
             n = begin + m
             if n <= last:
+                if n > 0:
+                    between = wp.float64(gap * wp.lerp(before, several[m], share))
+                    ahead -= between
+                    behind += between
+                bend = gap * share * (several[m + 1] - before) / 12.0
+                before = several[m]
                 q = _on_line(pair, line, n, k)
-                a = float(ahead) + wp.where(float(last - n) > lit, _DARK, 0.0)
-                b = float(behind) + wp.where(float(n) > opposite, _DARK, 0.0)
+                a = wp.max(float(ahead) + bend, 0.0) + wp.where(float(last - n) > lit, _DARK, 0.0)
+                b = wp.max(float(behind) - bend, 0.0) + wp.where(float(n) > opposite, _DARK, 0.0)
                 nodes[q[0], q[1], q[2], q[3]] = wp.vec2(a, b)
-                ahead -= wp.float64(several[m])
-                behind += wp.float64(several[m])
 
 
 @for_smoke
-def _measure(smoke_type: Any, pairs: int) -> wp.Kernel:
+def _measure(smoke_type: Any) -> wp.Kernel:
     @wp.kernel(module="unique", module_options=OPTIONS)
     def kernel(
         # in:
         smoke: smoke_type,
         lattice: Lattice,
-        parts: wp.vec2i,
+        parts: int,
         # out:
-        gaps: wp.array4d[wp.float16],
+        extinctions: wp.array3d[wp.float16],
     ):
-        """Computes the optical depth from a node to the next node along the axis of each pair of opposite lights."""
+        """Computes the extinction at a node or, if there are `parts`, its mean over parts of the way to the next."""
         i, j, k = wp.tid()
         begin = _node(lattice, i, j, k)
         size = box_of(smoke)
-        for pair in range(wp.static(pairs)):
-            tau = float(0.0)
-            if wp.where(pair == 0, i, j) < wp.where(pair == 0, gaps.shape[1], gaps.shape[2]) - 1:
-                along = axis(lattice, pair)
-                d = lattice.gap[pair] / float(parts[pair])
-                for n in range(parts[pair]):
-                    p = begin + (float(n) + 0.5) * d * along
-                    # Nodes of a rotated lattice may lie far outside the grid.
-                    low = wp.min(p) >= -0.5
-                    if low and p[0] <= size[0] + 0.5 and p[1] <= size[1] + 0.5 and p[2] <= size[2] + 0.5:
-                        tau += d * sample(smoke, p)
-            gaps[pair, i, j, k] = wp.float16(wp.min(smoke.extinction * tau, _DEEPEST))
+        total = float(0.0)
+        for n in range(wp.max(parts, 1)):
+            p = begin
+            if parts > 0:
+                p += (float(n) + 0.5) * lattice.gap[0] / float(parts) * axis(lattice, 0)
+            # Nodes of a rotated lattice may lie far outside the grid.
+            low = wp.min(p) >= -0.5
+            if low and p[0] <= size[0] + 0.5 and p[1] <= size[1] + 0.5 and p[2] <= size[2] + 0.5:
+                total += sample(smoke, p)
+        total *= smoke.extinction / float(wp.max(parts, 1))
+        extinctions[i, j, k] = wp.float16(wp.min(total, _DEEPEST))
 
     return kernel
 
@@ -244,14 +254,13 @@ def add_up(medium: Medium, lattice: Lattice, counts: Sequence[int], pairs: int, 
     """Computes the optical depths from the nodes of a lattice of `make_lattice` to one or two `pairs` of opposite
     lights at infinity: at both ends of the lattice's first axis, and of its second.
 
-    `step` is the longest step between two nodes, in voxels. Returns vec2 [pairs, X, Y, Z] for each node: depths
-    to the light at the axis's end and to the light at its start.
+    `step` is the longest step between two nodes of one pair, in voxels; those of two pairs are one step apart. Returns
+    vec2 [pairs, X, Y, Z] for each node: depths to the light at the axis's end and to the light at its start.
     """
-    parts = wp.vec2i(*(parts_of(lattice.gap[n], step) for n in range(2)))
-    gaps, nodes = (medium.buffer((pairs, *counts), dtype) for dtype in (wp.float16, wp.vec2))
-    _measure(medium, tuple(counts), [lattice, parts], [gaps], pairs)
+    extinctions, nodes = medium.buffer(tuple(counts), wp.float16), medium.buffer((pairs, *counts), wp.vec2)
+    _measure(medium, tuple(counts), [lattice, parts_of(lattice.gap[0], step) if pairs == 1 else 0], [extinctions])
     lines = max(counts[:2]) if pairs == 2 else counts[1]
-    inputs = [gaps, lattice, medium.solid or Solid()]
+    inputs = [extinctions, lattice, medium.solid or Solid(), 0.5 * (pairs - 1)]
     wp.launch(_add_up, (pairs, lines, counts[2]), inputs, [nodes], device=medium.device)
     return nodes
 
