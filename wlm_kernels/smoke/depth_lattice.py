@@ -36,7 +36,7 @@ voxels."""
 _MOST_MARCHING = 2**24  # largest number of nodes of a point light, each of which marches separately
 _AT_ONCE = wp.constant(8)  # nodes of a line that a thread sums at a time
 _LEAST_SPACING = 0.25  # voxels between nodes
-_DEEPEST = wp.constant(60000.0)  # largest extinction, within the range of half floats
+_DEEPEST = wp.constant(60000.0)  # largest extinction and depth, within the range of half floats
 _NEVER = wp.constant(1.0e30)
 _DARK = wp.constant(6.0)  # optical depth of an obstacle: a larger one would widen shadows between nodes
 _ROUNDING = 1e-6  # relative excess of a part over the step that is tolerated, so that rounding adds no part
@@ -68,7 +68,7 @@ def axis(lattice: Lattice, n: int) -> wp.vec3:
 
 
 @wp.func
-def depths_at(nodes: wp.array3d[wp.vec2], lattice: Lattice, p: wp.vec3) -> wp.vec2:
+def depths_at(nodes: wp.array3d[wp.vec2h], lattice: Lattice, p: wp.vec3) -> wp.vec2:
     """Interpolates optical depths to the light and to the opposite light trilinearly between nodes."""
     inverse = wp.vec3(1.0 / lattice.gap[0], 1.0 / lattice.gap[1], 1.0 / lattice.gap[2])
     return between_nodes(nodes, wp.cw_mul(lattice.axes * (p - lattice.origin) - lattice.low, inverse))
@@ -104,7 +104,7 @@ def _add_up(
     solid: Solid,
     share: float,
     # out:
-    nodes: wp.array4d[wp.vec2],
+    nodes: wp.array4d[wp.vec2h],
 ):
     """Sums optical depths from each node of a line to both of its ends; the light is beyond the last node. The
     extinction between two nodes is that of the first, and of the second by `share`."""
@@ -149,7 +149,7 @@ def _add_up(
                 q = _on_line(pair, line, n, k)
                 a = wp.max(float(ahead) + bend, 0.0) + wp.where(float(last - n) > lit, _DARK, 0.0)
                 b = wp.max(float(behind) - bend, 0.0) + wp.where(float(n) > opposite, _DARK, 0.0)
-                nodes[q[0], q[1], q[2], q[3]] = wp.vec2(a, b)
+                nodes[q[0], q[1], q[2], q[3]] = wp.vec2h(wp.float16(wp.min(a, _DEEPEST)), wp.float16(wp.min(b, _DEEPEST)))
 
 
 @for_smoke
@@ -191,7 +191,7 @@ def _reach(smoke_type: Any) -> wp.Kernel:
         lattice: Lattice,
         step: float,
         # out:
-        nodes: wp.array3d[wp.vec2],
+        nodes: wp.array3d[wp.vec2h],
     ):
         i, j, k = wp.tid()
         p = _node(lattice, i, j, k)
@@ -212,7 +212,7 @@ def _reach(smoke_type: Any) -> wp.Kernel:
             skipped = wp.max(lattice.gap)
             if skipped + way_to_solid(smoke.solid, p + skipped * toward, toward) < away:
                 tau += _DARK
-        nodes[i, j, k] = wp.vec2(tau, 0.0)
+        nodes[i, j, k] = wp.vec2h(wp.float16(wp.min(tau, _DEEPEST)), wp.float16(0.0))
 
     return kernel
 
@@ -255,9 +255,9 @@ def add_up(medium: Medium, lattice: Lattice, counts: Sequence[int], pairs: int, 
     lights at infinity: at both ends of the lattice's first axis, and of its second.
 
     `step` is the longest step between two nodes of one pair, in voxels; those of two pairs are one step apart. Returns
-    vec2 [pairs, X, Y, Z] for each node: depths to the light at the axis's end and to the light at its start.
+    vec2h [pairs, X, Y, Z] for each node: depths to the light at the axis's end and to the light at its start.
     """
-    extinctions, nodes = medium.buffer(tuple(counts), wp.float16), medium.buffer((pairs, *counts), wp.vec2)
+    extinctions, nodes = medium.buffer(tuple(counts), wp.float16), medium.buffer((pairs, *counts), wp.vec2h)
     _measure(medium, tuple(counts), [lattice, parts_of(lattice.gap[0], step) if pairs == 1 else 0], [extinctions])
     lines = max(counts[:2]) if pairs == 2 else counts[1]
     inputs = [extinctions, lattice, medium.solid or Solid(), 0.5 * (pairs - 1)]
@@ -270,7 +270,7 @@ def reach(medium: Medium, place: Sequence[float], radius: float | None, march: M
     or the position of a point light in voxels with a radius in voxels, within which its irradiance is constant.
 
     Of `march` only the spacing is used, or the step; the lattice of a point light has at most 2^24 nodes. Returns a
-    lattice, and vec2 [X, Y, Z] at its nodes: depths to the light and to the opposite light, for a point light 0.
+    lattice, and vec2h [X, Y, Z] at its nodes: depths to the light and to the opposite light, for a point light 0.
     """
     spacing, shape = march.spacing or march.step, medium.shape
     if radius is None:
@@ -278,7 +278,7 @@ def reach(medium: Medium, place: Sequence[float], radius: float | None, march: M
         return lattice, add_up(medium, lattice, counts, 1, spacing).reshape(counts)
     lattice, counts = make_lattice(shape, ((1, 0, 0), (0, 1, 0), (0, 0, 1)), spacing, most=_MOST_MARCHING)
     lattice.place, lattice.point, lattice.radius = wp.vec3(*place), 1, float(radius)
-    nodes = medium.buffer(counts, wp.vec2)
+    nodes = medium.buffer(counts, wp.vec2h)
     _reach(medium, counts, [lattice, spacing], [nodes])
     return lattice, nodes
 

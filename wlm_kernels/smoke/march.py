@@ -379,6 +379,17 @@ def sample(smoke: Any, p: wp.vec3) -> float:
 
 
 @wp.func
+def full(value: Any):
+    """Returns a value of an array in single precision."""
+    return value
+
+
+@wp.func
+def full(value: wp.vec2h):
+    return wp.vec2(float(value[0]), float(value[1]))
+
+
+@wp.func
 def between_nodes(nodes: wp.array3d[Any], q: wp.vec3):
     """Interpolates an array trilinearly at the index q, which may have fractions; q is clamped to the array."""
     x = wp.clamp(q[0], 0.0, float(nodes.shape[0] - 1))
@@ -392,8 +403,10 @@ def between_nodes(nodes: wp.array3d[Any], q: wp.vec3):
     k1 = wp.min(k + 1, nodes.shape[2] - 1)
     fy = y - float(j)
     fz = z - float(k)
-    near = wp.lerp(wp.lerp(nodes[i, j, k], nodes[i, j, k1], fz), wp.lerp(nodes[i, j1, k], nodes[i, j1, k1], fz), fy)
-    far = wp.lerp(wp.lerp(nodes[i1, j, k], nodes[i1, j, k1], fz), wp.lerp(nodes[i1, j1, k], nodes[i1, j1, k1], fz), fy)
+    near = wp.lerp(full(nodes[i, j, k]), full(nodes[i, j, k1]), fz)
+    near = wp.lerp(near, wp.lerp(full(nodes[i, j1, k]), full(nodes[i, j1, k1]), fz), fy)
+    far = wp.lerp(full(nodes[i1, j, k]), full(nodes[i1, j, k1]), fz)
+    far = wp.lerp(far, wp.lerp(full(nodes[i1, j1, k]), full(nodes[i1, j1, k1]), fz), fy)
     return wp.lerp(near, far, x - float(i))
 
 
