@@ -19,6 +19,7 @@ _TENSORS = {
     float: (torch.float32, ()),
     wp.int64: (torch.int64, ()),
     wp.float16: (torch.float16, ()),
+    wp.vec2: (torch.float32, (2,)),
     wp.vec2h: (torch.float16, (2,)),
     wp.vec4: (torch.float32, (4,)),
 }
