@@ -103,8 +103,7 @@ class Medium:
 
     `empty` allocates buffers on the density's device; None: Warp's own allocator. `bricks` tells which bricks of 8^3
     voxels contain smoke, a result of `occupied`; None: marches sample every voxel. With `places`, int [X / 8, Y / 8,
-    Z / 8], the numbers of bricks in `density` and `temperature`, these are [8 N, 8, 8], with 0 in brick 0, and `bricks`
-    must be given; None: all voxels are stored. `cells` are X, Y and Z; None: the density's. `solid` are obstacles in
+    Z / 8], the numbers of bricks in `density` and `temperature`, these are [8 N, 8, 8], with 0 in brick 0; None: all voxels are stored. `cells` are X, Y and Z; None: the density's. `solid` are obstacles in
     the way of light and camera; None: there are none.
     """
 
