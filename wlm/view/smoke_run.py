@@ -112,18 +112,18 @@ def run(
         clock.stop(SIMULATION)
         drawing.move(scene.time(number))
         # The solver alternates between buffers, and larger ones may replace them.
-        density = solver.frame().density
-        place = (density.data_ptr(), density.shape)
+        frame = solver.frame()
+        place = (frame.density.data_ptr(), frame.density.shape)
         if place not in graphs:
             if len(graphs) == solver.period:
                 graphs.clear()
-            graphs[place] = [light, draw] if lighting.network else [StepGraph(each, device, 1) for each in (light, draw)]
+            graphs[place] = [each if lighting.network else StepGraph(each, device, 1) for each in (light, draw)]
         for stage, step in zip((lighting.stage, DRAWING), graphs[place], strict=True):
             step()
             clock.stop(stage)
         pixels = to_bytes(drawing.image, white)
         clock.stop(BYTES)
-        smoke = smoke or any(bool(slab.any()) for slab in (frame := solver.frame()).slabs(frame.density))
+        smoke = smoke or any(bool(slab.any()) for slab in frame.slabs(frame.density))
         yield Frame(number, pixels, smoke, clock.seconds)
         meter.report(number)
 

@@ -4,8 +4,8 @@ For a light at infinity the lattice has lines that run towards the light. The op
 nodes of a line is marched once; sums along the line from both of its ends are the depths to the light and to the
 opposite light. This takes as many samples as there are nodes, where a march from each node would take a line of
 samples per node. A lattice has one pair of opposite lights along its first axis, or two pairs along its first and
-second axes, which share samples at the nodes (trapezoidal rule). The lattice of a point light follows the grid's axes, and each node marches to the light separately, since
-no two of its rays are parallel.
+second axes, which share samples at the nodes. The lattice of a point light follows the grid's axes, and each node
+marches to the light separately, since no two of its rays are parallel.
 
 Units and sampling are those of `march`.
 """
@@ -91,6 +91,11 @@ def _lit_way(solid: Solid, end: wp.vec4i, lattice: Lattice, toward: wp.vec3) -> 
 
 
 @wp.func
+def _stored(a: float, b: float) -> wp.vec2h:
+    return wp.vec2h(wp.float16(wp.min(a, _DEEPEST)), wp.float16(wp.min(b, _DEEPEST)))
+
+
+@wp.func
 def _on_line(pair: int, line: int, n: int, k: int) -> wp.vec4i:
     """Returns the indices of the n-th node of a line along the first axis (pair 0) or along the second one."""
     return wp.vec4i(pair, wp.where(pair == 0, n, line), wp.where(pair == 0, line, n), k)
@@ -149,7 +154,7 @@ def _add_up(
                 q = _on_line(pair, line, n, k)
                 a = wp.max(float(ahead) + bend, 0.0) + wp.where(float(last - n) > lit, _DARK, 0.0)
                 b = wp.max(float(behind) - bend, 0.0) + wp.where(float(n) > opposite, _DARK, 0.0)
-                nodes[q[0], q[1], q[2], q[3]] = wp.vec2h(wp.float16(wp.min(a, _DEEPEST)), wp.float16(wp.min(b, _DEEPEST)))
+                nodes[q[0], q[1], q[2], q[3]] = _stored(a, b)
 
 
 @for_smoke
@@ -212,7 +217,7 @@ def _reach(smoke_type: Any) -> wp.Kernel:
             skipped = wp.max(lattice.gap)
             if skipped + way_to_solid(smoke.solid, p + skipped * toward, toward) < away:
                 tau += _DARK
-        nodes[i, j, k] = wp.vec2h(wp.float16(wp.min(tau, _DEEPEST)), wp.float16(0.0))
+        nodes[i, j, k] = _stored(tau, 0.0)
 
     return kernel
 

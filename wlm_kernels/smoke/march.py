@@ -103,8 +103,9 @@ class Medium:
 
     `empty` allocates buffers on the density's device; None: Warp's own allocator. `bricks` tells which bricks of 8^3
     voxels contain smoke, a result of `occupied`; None: marches sample every voxel. With `places`, int [X / 8, Y / 8,
-    Z / 8], the numbers of bricks in `density` and `temperature`, these are [8 N, 8, 8], with 0 in brick 0; None: all voxels are stored. `cells` are X, Y and Z; None: the density's. `solid` are obstacles in
-    the way of light and camera; None: there are none.
+    Z / 8], the numbers of bricks in `density` and `temperature`, these are [8 N, 8, 8], with 0 in brick 0; None: all
+    voxels are stored. `cells` are X, Y and Z; None: the density's. `solid` are obstacles in the way of light and
+    camera; None: there are none.
     """
 
     density: wp.array
@@ -378,13 +379,13 @@ def sample(smoke: Any, p: wp.vec3) -> float:
 
 
 @wp.func
-def full(value: Any):
+def _full(value: Any):
     """Returns a value of an array in single precision."""
     return value
 
 
 @wp.func
-def full(value: wp.vec2h):
+def _full(value: wp.vec2h):
     return wp.vec2(float(value[0]), float(value[1]))
 
 
@@ -402,10 +403,10 @@ def between_nodes(nodes: wp.array3d[Any], q: wp.vec3):
     k1 = wp.min(k + 1, nodes.shape[2] - 1)
     fy = y - float(j)
     fz = z - float(k)
-    near = wp.lerp(full(nodes[i, j, k]), full(nodes[i, j, k1]), fz)
-    near = wp.lerp(near, wp.lerp(full(nodes[i, j1, k]), full(nodes[i, j1, k1]), fz), fy)
-    far = wp.lerp(full(nodes[i1, j, k]), full(nodes[i1, j, k1]), fz)
-    far = wp.lerp(far, wp.lerp(full(nodes[i1, j1, k]), full(nodes[i1, j1, k1]), fz), fy)
+    near = wp.lerp(_full(nodes[i, j, k]), _full(nodes[i, j, k1]), fz)
+    near = wp.lerp(near, wp.lerp(_full(nodes[i, j1, k]), _full(nodes[i, j1, k1]), fz), fy)
+    far = wp.lerp(_full(nodes[i1, j, k]), _full(nodes[i1, j, k1]), fz)
+    far = wp.lerp(far, wp.lerp(_full(nodes[i1, j1, k]), _full(nodes[i1, j1, k1]), fz), fy)
     return wp.lerp(near, far, x - float(i))
 
 
@@ -558,8 +559,10 @@ def _start(places: wp.array3d[int], i: int, j: int, c: int) -> wp.vec3i:
 
 @for_smoke
 def _runs(smoke_type: Any) -> wp.Kernel:
+    density = smoke_type.vars["density"].type
+
     @wp.func_native(_ANY)
-    def holds_any(field: smoke_type.vars["density"].type, i: int, j: int, k: int, count: int) -> bool: ...
+    def holds_any(field: density, i: int, j: int, k: int, count: int) -> bool: ...
 
     @wp.kernel(module="unique", module_options=OPTIONS)
     def kernel(

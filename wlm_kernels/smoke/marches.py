@@ -25,7 +25,6 @@ from wlm_kernels.smoke.march import (
     box_of,
     emitted,
     for_smoke,
-    full,
     in_tiles,
     look,
     optical_depth,
@@ -132,12 +131,18 @@ def guide(medium: Medium, view: View, march: March, out: wp.array, *, shared: bo
 
 
 @wp.func
+def _depths(nodes: wp.array4d[wp.vec2h], pair: int, i: int, j: int, k: int) -> wp.vec2:
+    both = nodes[pair, i, j, k]
+    return wp.vec2(float(both[0]), float(both[1]))
+
+
+@wp.func
 def _in_plane(nodes: wp.array4d[wp.vec2h], i: int, j: int, k: int, fx: float, fy: float) -> wp.vec4:
     sides = wp.vec4()
     for pair in range(2):
-        near = wp.lerp(full(nodes[pair, i, j, k]), full(nodes[pair, i, j + 1, k]), fy)
-        far = wp.lerp(full(nodes[pair, i + 1, j, k]), full(nodes[pair, i + 1, j + 1, k]), fy)
-        c = wp.lerp(near, far, fx)
+        a = wp.lerp(_depths(nodes, pair, i, j, k), _depths(nodes, pair, i, j + 1, k), fy)
+        b = wp.lerp(_depths(nodes, pair, i + 1, j, k), _depths(nodes, pair, i + 1, j + 1, k), fy)
+        c = wp.lerp(a, b, fx)
         sides[2 * pair] = c[0]
         sides[2 * pair + 1] = c[1]
     return sides
