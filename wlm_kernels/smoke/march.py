@@ -34,7 +34,7 @@ BRICK = 8
 OPTIONS = {"enable_backward": False}
 """Options of every module of smoke kernels."""
 
-_AHEAD = wp.constant(4)  # steps of a ray that are sampled at a time
+_AHEAD = wp.constant(4)  # steps of a ray that a GPU samples at a time
 _NEVER = wp.constant(1.0e30)
 _SEEDS = 2**32
 _PATTERNS = wp.constant(64)  # number of patterns of the gradient noise, a power of 2
@@ -464,19 +464,31 @@ def begin_jittered(view: View, row: int, column: int, smoke: Any, march: MarchPa
     return begin(view, row, column, smoke, march.step, offset)
 
 
+# A GPU's thread would wait for the memory in each step.
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+return {int(_AHEAD)};
+#else
+return 1;
+#endif
+""")
+def _at_once() -> int: ...
+
+
 @wp.func
 def look(r: Ray, smoke: Any) -> Ray:
     """Samples the smoke in the ray's current step: sets the step's `distance`, `place`, `sigma` and `x`. Steps must
     follow one another from step 0."""
-    if r.done % _AHEAD == 0:
-        # Several steps at a time: from step to step a thread would wait for the memory each time.
+    if r.done % _at_once() == 0:
         some = bool(False)
         for n in range(_AHEAD):
-            some = _has_smoke(smoke.bricks, point_on(r, r.done + n, r.offset)) or some
+            if n < _at_once():
+                some = _has_smoke(smoke.bricks, point_on(r, r.done + n, r.offset)) or some
         r.ahead = _Several()
         if some:
             for n in range(_AHEAD):
-                r.ahead[n] = density_at(smoke.density, smoke, point_on(r, r.done + n, r.offset))
+                if n < _at_once():
+                    r.ahead[n] = density_at(smoke.density, smoke, point_on(r, r.done + n, r.offset))
     r.distance = r.first + (float(r.done) + r.offset) * r.length
     r.place = r.origin + r.distance * r.direction
     r.sigma = smoke.extinction * r.ahead[0]
