@@ -10,6 +10,7 @@ marches to the light separately, since no two of its rays are parallel.
 Units and sampling are those of `march`.
 """
 
+import functools
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -35,6 +36,7 @@ voxels."""
 
 _MOST_MARCHING = 2**24  # largest number of nodes of a point light, each of which marches separately
 _AT_ONCE = wp.constant(8)  # nodes of a line that a thread sums at a time
+_NODES = wp.constant(4)  # nodes that a thread samples
 _LEAST_SPACING = 0.25  # voxels between nodes
 _DEEPEST = wp.constant(60000.0)  # largest extinction and depth, within the range of half floats
 _NEVER = wp.constant(1.0e30)
@@ -81,80 +83,70 @@ def _node(lattice: Lattice, i: int, j: int, k: int) -> wp.vec3:
 
 
 @wp.func
-def _lit_way(solid: Solid, end: wp.vec4i, lattice: Lattice, toward: wp.vec3) -> float:
-    """Computes how far from the end of a line its nodes are lit by a light beyond the end; negative: nowhere."""
-    p = _node(lattice, end[1], end[2], end[3])
-    if way_to_solid(solid, p, toward) < _NEVER:
-        return -1.0
-    # A gap more, since light is interpolated between nodes: else the lit side of an obstacle would be dark.
-    return way_to_solid(solid, p, -toward) + wp.length(wp.cw_mul(lattice.axes * toward, lattice.gap))
-
-
-@wp.func
-def _stored(a: float, b: float) -> wp.vec2h:
-    return wp.vec2h(wp.float16(wp.min(a, _DEEPEST)), wp.float16(wp.min(b, _DEEPEST)))
-
-
-@wp.func
-def _on_line(pair: int, line: int, n: int, k: int) -> wp.vec4i:
+def _on_line(pair: int, line: int, n: int, k: int) -> wp.vec3i:
     """Returns the indices of the n-th node of a line along the first axis (pair 0) or along the second one."""
-    return wp.vec4i(pair, wp.where(pair == 0, n, line), wp.where(pair == 0, line, n), k)
+    return wp.vec3i(wp.where(pair == 0, n, line), wp.where(pair == 0, line, n), k)
 
 
-@wp.kernel(module="unique", module_options=OPTIONS)
-def _add_up(
-    # in:
-    extinctions: wp.array3d[wp.float16],
-    lattice: Lattice,
-    solid: Solid,
-    share: float,
-    # out:
-    nodes: wp.array4d[wp.vec2h],
-):
-    """Sums optical depths from each node of a line to both of its ends; the light is beyond the last node. The
-    extinction between two nodes is that of the first, and of the second by `share`."""
-    pair, line, k = wp.tid()
-    last = wp.where(pair == 0, nodes.shape[1], nodes.shape[2]) - 1
-    if line >= wp.where(pair == 0, nodes.shape[2], nodes.shape[1]):
-        return
-    gap = wp.where(pair == 0, lattice.gap[0], lattice.gap[1])
-    # Nodes farther from the last node, and from the first one, are in the shadow of obstacles.
-    lit = float(_NEVER)
-    opposite = float(_NEVER)
-    if solid.mesh != wp.uint64(0):
-        lit = _lit_way(solid, _on_line(pair, line, last, k), lattice, axis(lattice, pair)) / gap
-        opposite = _lit_way(solid, _on_line(pair, line, 0, k), lattice, -axis(lattice, pair)) / gap
-    # In double precision, since the depth ahead is a difference. Several nodes at a time, since loads wait for earlier
-    # stores.
-    ahead = wp.float64(0.0)
-    before = float(0.0)
-    for n in range(last + 1):
-        q = _on_line(pair, line, n, k)
-        now = float(extinctions[q[1], q[2], q[3]])
-        if n > 0:
-            ahead += wp.float64(gap * wp.lerp(before, now, share))
-        before = now
-    behind = wp.float64(0.0)
-    before = float(0.0)
-    for begin in range(0, last + 1, _AT_ONCE):
-        several = _Several()
-        for m in range(_AT_ONCE + 1):
-            if begin + m <= last:
-                q = _on_line(pair, line, begin + m, k)
-                several[m] = float(extinctions[q[1], q[2], q[3]])
-        for m in range(_AT_ONCE):
-            n = begin + m
-            if n <= last:
-                if n > 0:
-                    between = wp.float64(gap * wp.lerp(before, several[m], share))
-                    ahead -= between
-                    behind += between
-                bend = gap * share * (several[m + 1] - before) / 12.0
-                before = several[m]
-                q = _on_line(pair, line, n, k)
-                a = wp.max(float(ahead) + bend, 0.0) + wp.where(float(last - n) > lit, _DARK, 0.0)
-                b = wp.max(float(behind) - bend, 0.0) + wp.where(float(n) > opposite, _DARK, 0.0)
-                nodes[q[0], q[1], q[2], q[3]] = _stored(a, b)
+@wp.func
+def _stored(depth: float) -> wp.float16:
+    return wp.float16(wp.min(depth, _DEEPEST))
+
+
+@functools.cache
+def _add_up(with_solid: bool) -> wp.Kernel:
+    @wp.kernel(module="unique", module_options=OPTIONS)
+    def kernel(
+        # in:
+        extinctions: wp.array3d[wp.float16],
+        lattice: Lattice,
+        solid: Solid,
+        share: float,
+        # out:
+        nodes: wp.array4d[wp.vec2h],
+    ):
+        """Sums optical depths from each node of a line to its last node (end 0), beyond which the light is, or to the
+        first one (end 1). The extinction between two nodes is that of the first, and of the second by `share`."""
+        both, line, k = wp.tid()
+        pair = both // 2
+        end = both % 2
+        last = wp.where(pair == 0, nodes.shape[1], nodes.shape[2]) - 1
+        if line >= wp.where(pair == 0, nodes.shape[2], nodes.shape[1]):
+            return
+        gap = wp.where(pair == 0, lattice.gap[0], lattice.gap[1])
+        # Nodes farther from the end than `lit` are in the shadow of obstacles.
+        lit = float(_NEVER)
+        if wp.static(with_solid):
+            q = _on_line(pair, line, wp.where(end == 0, last, 0), k)
+            p = _node(lattice, q[0], q[1], q[2])
+            toward = wp.where(end == 0, 1.0, -1.0) * axis(lattice, pair)
+            lit = -1.0
+            if way_to_solid(solid, p, toward) >= _NEVER:
+                # A gap more, since light is interpolated between nodes: else the lit side of an obstacle would be dark.
+                lit = way_to_solid(solid, p, -toward) / gap + 1.0
+        # The extinction between nodes is that of the first one: seen from end 1, of the node before.
+        beside = wp.where(end == 0, 1.0 - share, share)
+        depth = float(0.0)
+        before = float(0.0)
+        # Several nodes at a time, since loads wait for earlier stores.
+        for begin in range(0, last + 1, _AT_ONCE):
+            several = _Several()
+            for m in range(_AT_ONCE + 1):
+                if begin + m <= last:
+                    q = _on_line(pair, line, wp.where(end == 0, last - begin - m, begin + m), k)
+                    several[m] = gap * float(extinctions[q[0], q[1], q[2]])
+            for m in range(_AT_ONCE):
+                n = begin + m
+                if n <= last:
+                    if n > 0:
+                        depth += wp.lerp(before, several[m], beside)
+                    # The trapezoidal rule, with the correction for the slope at its end.
+                    through = wp.max(depth - share * (several[m + 1] - before) / 12.0, 0.0)
+                    before = several[m]
+                    q = _on_line(pair, line, wp.where(end == 0, last - n, n), k)
+                    nodes[pair, q[0], q[1], q[2]][end] = _stored(through + wp.where(float(n) > lit, _DARK, 0.0))
+
+    return kernel
 
 
 @for_smoke
@@ -169,20 +161,23 @@ def _measure(smoke_type: Any) -> wp.Kernel:
         extinctions: wp.array3d[wp.float16],
     ):
         """Computes the extinction at a node or, if there are `parts`, its mean over parts of the way to the next."""
-        i, j, k = wp.tid()
-        begin = _node(lattice, i, j, k)
+        i, j, several = wp.tid()
         size = box_of(smoke)
-        total = float(0.0)
-        for n in range(wp.max(parts, 1)):
-            p = begin
-            if parts > 0:
-                p += (float(n) + 0.5) * lattice.gap[0] / float(parts) * axis(lattice, 0)
-            # Nodes of a rotated lattice may lie far outside the grid.
-            low = wp.min(p) >= -0.5
-            if low and p[0] <= size[0] + 0.5 and p[1] <= size[1] + 0.5 and p[2] <= size[2] + 0.5:
-                total += sample(smoke, p)
-        total *= smoke.extinction / float(wp.max(parts, 1))
-        extinctions[i, j, k] = wp.float16(wp.min(total, _DEEPEST))
+        # To find its indices takes a thread longer than a node outside the smoke.
+        for m in range(_NODES):
+            k = several * _NODES + m
+            if k < extinctions.shape[2]:
+                begin = _node(lattice, i, j, k)
+                total = float(0.0)
+                for n in range(wp.max(parts, 1)):
+                    p = begin
+                    if parts > 0:
+                        p += (float(n) + 0.5) * lattice.gap[0] / float(parts) * axis(lattice, 0)
+                    # Nodes of a rotated lattice may lie far outside the grid.
+                    low = wp.min(p) >= -0.5
+                    if low and p[0] <= size[0] + 0.5 and p[1] <= size[1] + 0.5 and p[2] <= size[2] + 0.5:
+                        total += sample(smoke, p)
+                extinctions[i, j, k] = _stored(total * smoke.extinction / float(wp.max(parts, 1)))
 
     return kernel
 
@@ -213,11 +208,11 @@ def _reach(smoke_type: Any) -> wp.Kernel:
                 tau += d * sample(smoke, p + (first + (float(n) + 0.5) * d) * toward)
         tau = smoke.extinction * tau
         if smoke.solid.mesh != wp.uint64(0):
-            # As far from the lit side of an obstacle as a gap, light still falls: see `_lit_way`.
+            # As far from the lit side of an obstacle as a gap, light still falls: see `_add_up`.
             skipped = wp.max(lattice.gap)
             if skipped + way_to_solid(smoke.solid, p + skipped * toward, toward) < away:
                 tau += _DARK
-        nodes[i, j, k] = _stored(tau, 0.0)
+        nodes[i, j, k] = wp.vec2h(_stored(tau), wp.float16(0.0))
 
     return kernel
 
@@ -263,10 +258,11 @@ def add_up(medium: Medium, lattice: Lattice, counts: Sequence[int], pairs: int, 
     vec2h [pairs, X, Y, Z] for each node: depths to the light at the axis's end and to the light at its start.
     """
     extinctions, nodes = medium.buffer(tuple(counts), wp.float16), medium.buffer((pairs, *counts), wp.vec2h)
-    _measure(medium, tuple(counts), [lattice, parts_of(lattice.gap[0], step) if pairs == 1 else 0], [extinctions])
+    parts = parts_of(lattice.gap[0], step) if pairs == 1 else 0
+    _measure(medium, (*counts[:2], -(-counts[2] // int(_NODES))), [lattice, parts], [extinctions])
     lines = max(counts[:2]) if pairs == 2 else counts[1]
     inputs = [extinctions, lattice, medium.solid or Solid(), 0.5 * (pairs - 1)]
-    wp.launch(_add_up, (pairs, lines, counts[2]), inputs, [nodes], device=medium.device)
+    wp.launch(_add_up(medium.solid is not None), (2 * pairs, lines, counts[2]), inputs, [nodes], device=medium.device)
     return nodes
 
 
