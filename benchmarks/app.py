@@ -90,6 +90,7 @@ _OPTIONS: dict[str, tuple[Any, Any]] = {
     "parts": _option(bool, "--parts/--no-parts", True, help="Compress each object at each hour alone, too."),
     "steps": _option(int | None, "--steps", help="Optimisation steps of each fit. Default: the profile's.", min=1),
     "only": _option(_Names, "--only", help="Name of a variant to measure. Repeatable; default: all.", metavar="ROW"),
+    "smoke_path": _option(_Path, "--volume", help="Volume of smoke to measure too.", metavar="FILE"),
     "networks": _option(_Paths, "--network", help="File of a trained network to measure. Repeatable.", metavar="FILE"),
     "baseline_path": _option(
         _Path, "--baseline", help="Older result file; a kernel slower than there is an error.", metavar="OLD.json"
@@ -168,6 +169,10 @@ _COMMANDS: dict[str, tuple[str, tuple[str, ...]]] = {
     "smoke-network": (
         "Measure neural six-way lightmaps: time and error beside marches, flip books and path tracing.",
         ("quick", "device", "networks", "profiles"),
+    ),
+    "smoke-sizes": (
+        "Measure six-way lightmaps on grids of 16 to 400 voxels: marches, the network and diffusion on one clock.",
+        ("smoke_path", "quick", "device"),
     ),
     "ops": (
         "Measure differentiable operations: errors against float64, and times forward and backward beside torch.",

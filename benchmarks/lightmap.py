@@ -3,13 +3,13 @@
 The results table has these kinds of rows:
 
 - method "ours", one row for each profile: file size, time of the fit, errors of the float decode against the input,
-  time to decode the whole map to 8 bits by the fast kernel, and time to unpack one tile of the file. The largest error
+  time to decode all tiles to RGB9E5 by the fast kernel, and time to unpack one tile of the file. The largest error
   is in units of radiance, against a float64 decode.
 - method "exact" (a kernel of one texel per thread), one row for each way to compute the network's GELU, and on CUDA
-  "matrix" (the fast kernel on matrix units), all of profile M: error of the 8-bit output against the input, and largest
-  error against a float64 decode, where 1 stands for 255 levels. Rounding to 8 bits alone errs by 0.00196, half a level.
+  "matrix" (the fast kernel on matrix units), all of profile M: error of the RGB9E5 output against the input, and
+  largest error against a float64 decode in gamma space, relative to the largest colour that the tile can have.
 - method "texture", one row for each profile: the map as a renderer samples it, one RGB9E5 texture with all mips
-  (`wlm.lightmap.runtime`): its errors, and the time to decode it.
+  (`benchmarks.rivals.whole_tiles`): its errors, and the time to decode it.
 - method "pages", one row for each profile with networks: all pages of all mips as a virtual texture holds them, RGB9E5
   with a border of 4 texels, from one list (`wlm.lightmap.virtual`): errors of the texels of the map, the largest as for
   "exact", and the time to decode all pages.
@@ -39,6 +39,13 @@ from benchmarks.plot import Panel
 from benchmarks.rivals.lightmap import RIVALS, check_rival, encode_set, usual
 from benchmarks.rivals.lightmap_torch import PlainFit, dynamic_targets
 from benchmarks.rivals.whole_map import WholeMap
+from benchmarks.rivals.whole_tiles import (
+    ExactDecoder,
+    FrameDecoder,
+    MatrixDecoder,
+    TileDecoder,
+    fast_decoder,
+)
 from benchmarks.rows import Row
 from benchmarks.runner import Bench, Fit, Note, demo_data, expect_alone
 from wlm.errors import WlmError
@@ -50,13 +57,6 @@ from wlm.lightmap.evaluation import bits_per_texel, count_kinds
 from wlm.lightmap.fit import compress
 from wlm.lightmap.model import PACKED_KINDS, SheetModel
 from wlm.lightmap.profile import Profile, TimeAxis
-from wlm.lightmap.runtime import (
-    ExactDecoder,
-    FrameDecoder,
-    MatrixDecoder,
-    RuntimeDecoder,
-    fast_decoder,
-)
 from wlm.lightmap.tiles import TILE, TileGrid, TileKind, place
 from wlm.lightmap.view_scores import VIEWS, Tally, views_of
 from wlm.lightmap.virtual.texture import STRIDE, VirtualTexture
@@ -254,7 +254,7 @@ class _LightmapBench(Bench):
         return self.fit(profile.name, lambda: compress(self.set, profile, device=self.device))
 
     def profile_row(self, fit: Fit) -> tuple[Row, Callable[[], object]]:
-        """Returns the row of a compressed model, and a call that decodes the model to 8 bits, for the timing."""
+        """Returns the row of a compressed model, and a call that decodes the model to RGB9E5, for the timing."""
         self.note(f"{fit.option}: measuring errors")
         model = fit.model.light
         decoder = SheetDecoder(model, self.device)
@@ -267,7 +267,7 @@ class _LightmapBench(Bench):
         row = self.row(
             "ours",
             fit.option,
-            f"{self.scored_at}errors of the float decode; time of the whole map to 8 bits, {self.mode}",
+            f"{self.scored_at}errors of the float decode; time of all tiles to RGB9E5, {self.mode}",
             bytes=model.memory_bytes,
             bpp=bits_per_texel(model, self.lightmaps.mask, model.memory_bytes),
             disk_bytes=fit.bytes,
@@ -317,8 +317,8 @@ class _LightmapBench(Bench):
         row = self.row(
             "pages",
             fit.option,
-            f"{self.scored_at}errors of the map itself, the largest as a share of 255; time of all pages of all mips "
-            f"with borders of {texture.layout.border} texels, {self.mode}",
+            f"{self.scored_at}errors of the map itself, the largest as a share of the tile's bound; time of all pages "
+            f"of all mips with borders of {texture.layout.border} texels, {self.mode}",
             max_error=worst,
             pages_decoded=timed.report()["decoded"],
             **self._score(found, fit.option, ("psnr",)),
@@ -335,15 +335,15 @@ class _LightmapBench(Bench):
         timed = _repeated(model, repeat)
         frames, error = [], 0.0
         for t in self.times:
-            tiles, worst = self._tiles_8bit(model, decoders, t, compare=t in self.error_times)
-            frames.append(self._assembled(tiles))
-            error = max(error, worst)
+            frames.append(self._assembled(self._decoded_tiles(model, decoders, t)))
+            if t in self.error_times:
+                error = max(error, self._largest_error(model, frames[-1], t))
         trained = ", as trained" if gelu == model.profile.gelu else ""
         row = self.row(
             path,
             _GELUS[gelu],
-            f"profile {fit.option}, GELU by {_GELUS[gelu]}{trained}; {self.scored_at}errors of the 8-bit output, the "
-            f"largest as a share of 255 at {_hours(self.error_times)}; time {self.mode}",
+            f"profile {fit.option}, GELU by {_GELUS[gelu]}{trained}; {self.scored_at}errors of the RGB9E5 output, the "
+            f"largest as a share of the tile's bound at {_hours(self.error_times)}; time {self.mode}",
             max_error=error,
             tiles_timed=len(timed.kind),
             # What an option costs shows in PSNR and in its largest error; FLIP would take most of the run.
@@ -481,9 +481,9 @@ class _LightmapBench(Bench):
         worst = {"worst_seen": score.worst_seen, "worst_between": score.worst_between}
         return figures | {key: where["psnr"] for key, where in worst.items() if where is not None}
 
-    def _decoders(self, model: SheetModel, path: str, gelu: str | None) -> list[RuntimeDecoder]:
+    def _decoders(self, model: SheetModel, path: str, gelu: str | None) -> list[TileDecoder]:
         """Makes the decoders of all tiles with feature maps or stored frames; tiles of constant light need none."""
-        decoders: list[RuntimeDecoder] = []
+        decoders: list[TileDecoder] = []
         if (model.kind == TileKind.DYNAMIC).any():
             if path == "fast":
                 decoders.append(fast_decoder(model, self.device))
@@ -497,7 +497,7 @@ class _LightmapBench(Bench):
             decoder.set_time(self.times[0])
         return decoders
 
-    def _decode(self, decoders: Sequence[RuntimeDecoder]) -> Callable[[], object]:
+    def _decode(self, decoders: Sequence[TileDecoder]) -> Callable[[], object]:
         def decode() -> None:
             for decoder in decoders:
                 decoder.decode()
@@ -505,22 +505,13 @@ class _LightmapBench(Bench):
         # Without any launch there is nothing to capture.
         return self.replay(decode) if decoders else decode
 
-    def _tiles_8bit(
-        self, model: SheetModel, decoders: Sequence[RuntimeDecoder], t: float, compare: bool
-    ) -> tuple[np.ndarray, float]:
-        """Decodes all tiles to 8 bits. Returns radiance and, if `compare`, the largest error, where 1 is 255 levels."""
+    def _decoded_tiles(self, model: SheetModel, decoders: Sequence[TileDecoder], t: float) -> np.ndarray:
+        """Decodes all tiles to RGB9E5 and returns their radiance."""
         tiles = np.zeros((self.grid.count, TILE, TILE, 3))
-        worst = 0.0
         for number in np.flatnonzero(model.kind == TileKind.CONSTANT).tolist():
             tiles[number] = decode_tile64(model, number, t)
         for decoder in decoders:
             decoder.set_time(t)
             decoder.decode()
-            shares = decoder.numpy()[..., :3] / 255.0
-            for number, share, bound in zip(decoder.numbers.tolist(), shares, decoder.bounds, strict=True):
-                tiles[number] = (share * bound) ** model.profile.gamma
-                peak = bound64(model, number, t)
-                if compare and peak > 0:
-                    exact = np.minimum(colour_tile64(model, number, t) / peak, 1.0)
-                    worst = max(worst, float(np.abs(share - exact).max()))
-        return tiles, worst
+            tiles[decoder.numbers] = decoder.numpy()
+        return tiles

@@ -81,7 +81,7 @@ def pages(paths: Sequence[str | os.PathLike[str]], index: str | os.PathLike[str]
         WlmError: A file is missing or is no result file.
     """
     index = Path(index)
-    head = f"Made by `python -m benchmarks report {' '.join(map(str, paths))} -o {index}`; changes by hand are lost."
+    head = f"`python -m benchmarks report {' '.join(map(str, paths))} -o {index}` makes this page."
     runs = [(Path(path), run) for path in paths for run in read_runs(path)]
     contents, links = {}, []
     for system, shown in _PAGES.items():
@@ -93,9 +93,7 @@ def pages(paths: Sequence[str | os.PathLike[str]], index: str | os.PathLike[str]
             continue
         pictures = sorted((index.parent / "images").glob(f"bench-{system}*.png"))
         plots = [f"![{picture.stem}](../images/{picture.name})\n" for picture in pictures]
-        rest = (
-            f"Some of {len(measured)} rows; `python -m benchmarks report FILE` prints all of a file of `benchmarks`.\n"
-        )
+        rest = f"This page has some of {len(measured)} rows. `python -m benchmarks report FILE` prints all rows.\n"
         runs_shown = ["## Measured by\n", *(f"- {command}" for command in commands), ""]
         page = f"{index.stem}/{system}.md"
         contents[page] = "\n".join([f"# Results: {system}\n", f"{head}\n", *plots, rest, *parts, *runs_shown])

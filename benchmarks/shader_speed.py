@@ -1,4 +1,4 @@
-"""Speed of the exported shaders of lightmaps on a GPU, beside the decoders of `wlm.lightmap.runtime`.
+"""Speed of the exported shaders of lightmaps on a GPU, beside the decoders of `benchmarks.rivals.whole_tiles`.
 
 The map has 1024 x 1024 texels with random maps and networks. The rows:
 
@@ -30,6 +30,7 @@ from benchmarks.lightmap import ALL, PAGE_FRAMES, PAGES, texels_of, view_of_all_
 from benchmarks.lightmap_run_time import _PlainCamera, large_model, random_sheet
 from benchmarks.rivals.browser_run import page_time
 from benchmarks.rivals.gl_run import Screen
+from benchmarks.rivals.whole_tiles import fast_decoder
 from benchmarks.rows import Row
 from benchmarks.runner import Bench, Note
 from wlm.bundle import Bundle
@@ -40,7 +41,6 @@ from wlm.lightmap.bundle import sheet_bundle
 from wlm.lightmap.decode import SheetDecoder
 from wlm.lightmap.model import LightmapModel
 from wlm.lightmap.profile import Profile
-from wlm.lightmap.runtime import fast_decoder
 from wlm.lightmap.shader import GROUP_SIZE
 from wlm.lightmap.sheet import LIGHT, Sheet
 from wlm.lightmap.tiles import TILE
@@ -124,7 +124,7 @@ class _ShaderBench(Bench):
         self.note(f"decoding {name}")
         model = random_sheet(self._side, np.array(_HOURS), 0, Profile.load(name))
         decoder = fast_decoder(model, self.device)
-        (ours,) = self.time_rows([(self.row("ours", name, f"8 bits, {self.mode}"), self.replay(decoder.decode))])
+        (ours,) = self.time_rows([(self.row("ours", name, f"RGB9E5, {self.mode}"), self.replay(decoder.decode))])
         made = sheet_bundle(Sheet(), model, name, "0" * 16, self.device)
         rows = [ours]
         for language, option, draw in [
@@ -167,7 +167,7 @@ class _ShaderBench(Bench):
         self.note("decoding a tile in Chromium")
         sheet, scene = random_sheet(TILE, np.array(_HOURS), 0, Profile.load("M")), f"a tile, {TILE} x {TILE}"
         decoder = fast_decoder(sheet, self.device)
-        (ours,) = self.time_rows([(self.row("ours", "M", f"8 bits, {self.mode}", scene=scene), decoder.decode)])
+        (ours,) = self.time_rows([(self.row("ours", "M", f"RGB9E5, {self.mode}", scene=scene), decoder.decode)])
         try:
             duration = page_time(LightmapModel("tile", "0" * 16, sheet.profile, {LIGHT: sheet}), self._repeats)
         except Exception as error:  # whatever a browser says

@@ -30,8 +30,6 @@ ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 DOCUMENTS = [ROOT / "README.md", *sorted([*DOCS.glob("*.md"), *DOCS.glob("notes/*.md"), *DOCS.glob("tutorials/*.md")])]
 RESULTS = sorted((DOCS / "results").glob("*.md"))
-# Drawn on a GPU from the same scenes before `demos.pictures` could draw them; their digests come with the next drawing.
-OTHERS = {"fire.png", "smoke-fan.png"}
 STATED = json.loads((DOCS / "figures.json").read_text(encoding="utf-8"))
 
 
@@ -125,12 +123,11 @@ def test_pictures_are_made_from_the_present_sources():
     stored = json.loads((DOCS / "images" / "sources.json").read_text(encoding="utf-8"))
     expected = {}
     for command, digests in (("benchmarks plots", digests_of_plots()), ("demos.pictures", digests_of_pictures())):
-        digests = {name: digest for name, digest in digests.items() if name not in OTHERS}
         stale = [name for name, digest in digests.items() if stored.get(name) != digest]
         assert not stale, f"{stale}: sources changed: run their demos and `python -m {command}`, and look at them"
         expected |= digests
     assert stored == expected
-    assert stored.keys() | OTHERS == {path.name for path in (DOCS / "images").glob("*.png")}
+    assert stored.keys() == {path.name for path in (DOCS / "images").glob("*.png")}
 
 
 def test_pages_are_short():

@@ -73,6 +73,7 @@ COMMANDS = [
         "smoke-network --device cpu --network young.safetensors --profile paper",
         {"networks": [Path("a/young.safetensors")], "profiles": ["paper"]},
     ),
+    (["smoke-sizes", "--volume", "b.vdb"], "smoke-sizes --volume b.vdb --device cpu", {"smoke_path": Path("b.vdb")}),
     (["kernels-profile", "--only", "rasterize"], "kernels-profile --device cpu --only rasterize", {}),
     (["ops", "--only", "plane"], "ops --device cpu --only plane", {"only": ["plane"]}),
     *(

@@ -154,7 +154,7 @@ def test_pages_by_system(tmp_path, monkeypatch):
     write_json("b.json", [OURS.with_figures(seen=40.0)], ENVIRONMENT | {"device_name": ""})
     made = pages(["a.json", "b.json"], "docs/all.md")
     assert list(made) == ["all.md", "all/lightmap.md", "all/smoke.md"]
-    head = "Made by `python -m benchmarks report a.json b.json -o docs/all.md`; changes by hand are lost."
+    head = "`python -m benchmarks report a.json b.json -o docs/all.md` makes this page."
     assert all(head in page for page in made.values())
     assert "- [lightmap](all/lightmap.md)" in made["all.md"]
     lightmap = made["all/lightmap.md"]

@@ -7,6 +7,7 @@ import torch
 from builders.bench_rows import by_option, check_outputs
 
 import benchmarks.smoke_network as bench
+import benchmarks.smoke_sizes as sizes
 from benchmarks.smoke_network import PANELS, QUICK, Subject, open_subjects, plotted, run_rows, score
 from wlm.smoke.model import SmokeModel
 from wlm.smoke.network.settings import DatasetSettings, NetworkSettings
@@ -71,6 +72,19 @@ def test_time_against_error(rows):
     # A network that hasn't learned yet gives back its guide, which is the coarse march.
     assert psnr["young, fp32"] == pytest.approx(psnr["coarse, h 0.8"], abs=0.01)
     assert psnr["raw, fp32"] is None and table["raw, fp32"].notes == "not trained"
+
+
+def test_grids_of_several_sizes(monkeypatch):
+    monkeypatch.setattr(sizes, "_QUICK", (12, 8))
+    monkeypatch.setattr(sizes, "_PIXELS", {"cpu": (16,)})
+    partial = []
+    rows = sizes.run(quick=True, device="cpu", done=lambda rows: partial.append(len(rows)))
+    assert partial == [len(rows) // 2, len(rows)]
+    for scene in ("plume, 12³, 16² pixels", "plume, 8³, 16² pixels"):
+        table = {row.option: row for row in rows if row.scene == scene}
+        assert all(row["time_ms"] > 0.0 for row in table.values())
+        assert table["bake, step 1"]["psnr"] > table["bake, step 4"]["psnr"] + 6.0
+        assert {"psnr"}.isdisjoint(table["bake, step 0.5"].figures | table["six pictures by diffusion"].figures)
 
 
 def test_parts_of_a_frame(rows):

@@ -16,7 +16,7 @@ import wlm
 from wlm.smoke import codec
 from wlm.smoke.codec import open_network, shipped
 from wlm.smoke.data import load_frames, read_six_way
-from wlm.smoke.march.six_way import bake_coarse
+from wlm.smoke.march.six_way import bake, bake_coarse
 from wlm.smoke.model import SmokeModel
 from wlm.smoke.network import onnx_file
 from wlm.smoke.network.planes import GUIDES, encode_lightmaps, render_guide
@@ -100,27 +100,31 @@ def test_a_training_is_stopped_and_resumed(trained, tmp_path, monkeypatch):
 def test_predict_marches_as_in_training(network, volume, tmp_path):
     out = tmp_path / "a.exr"
     text = call("smoke", "predict", volume, "-o", out, "--network", network, "--resolution", 20, "--seed", 4)
-    assert "their mean light" in text and "error" not in text
+    assert "their mean light" in text and "network" in text and "error" not in text
     six = read_six_way(out)
     # A tenth of the 24 voxels of the longest edge.
     march = March(2.4, seed=4, threshold=4.0 / 24)
     guide = render_guide(load_frames(volume).load(1), six.camera, "six", march)
     planes = wlm.load(network).decoder(height=20, width=six.camera.width)(guide)
-    # What its gate leaves of it: one share of all lightmaps, of the way from the guide to the network.
-    change, made = (planes - guide[[*range(6), 7, 6]])[:6], (encode_lightmaps(six) - guide[[*range(6), 7, 6]])[:6]
-    share = float((change * made).sum() / change.square().sum().clamp(min=1e-9))
-    assert -1e-3 <= share <= 1.001
-    torch.testing.assert_close(made, share * change, rtol=1e-2, atol=1e-3)
+    torch.testing.assert_close(encode_lightmaps(six)[:6], planes[:6], rtol=1e-2, atol=1e-3)
     call("smoke", "predict", volume, "-o", out, "--network", network, "--resolution", 20, "--seed", 5)
     assert not torch.equal(read_six_way(out).lightmaps, six.lightmaps)
     # As what bake wrote.
     call("smoke", "shade", out, "-o", tmp_path / "a.png")
 
 
-def test_predict_by_the_coarse_march(volume, tmp_path):
-    call("smoke", "predict", volume, "-o", tmp_path / "a.exr", "--resolution", 20, "--seed", 2)
+@pytest.mark.parametrize(
+    ("pixels", "method", "march"),
+    [
+        (60, "coarse march, step 1", lambda smoke, camera: bake_coarse(smoke, camera, March(1.0, seed=2))),
+        (8, "fine march, step 2", lambda smoke, camera: bake(smoke, camera, step=2.0)),
+    ],
+)
+def test_predict_by_the_faster_march(pixels, method, march, volume, tmp_path):
+    text = call("smoke", "predict", volume, "-o", tmp_path / "a.exr", "--resolution", pixels, "--seed", 2)
     six = read_six_way(tmp_path / "a.exr")
-    expected = bake_coarse(load_frames(volume).load(1), six.camera, March(1.0, seed=2))
+    expected = march(load_frames(volume).load(1), six.camera)
+    assert method in text and expected.method == method
     for name in ("lightmaps", "transparency", "emission"):
         torch.testing.assert_close(getattr(six, name), getattr(expected, name), rtol=1e-3, atol=1e-4)
 

@@ -10,6 +10,7 @@ from reference import temporal as reference
 from benchmarks import plain
 from wlm import interop
 from wlm.lightmap.profile import Profile, TimeAxis, encode_time
+from wlm.lightmap.tiles import TileCut
 from wlm.lightmap.trainer import Targets, Trainer
 
 TILE = 128
@@ -61,7 +62,7 @@ class Case:
         return TimeAxis(times, 24.0, "frames") if self.periodic else TimeAxis(times, None, "paper")
 
     def targets(self) -> Targets:
-        """Random colours on random masks; those of a tile depend on its number alone."""
+        """Random light on random masks; those of a tile depend on its number alone."""
         times = len(self.axis().times)
         colour, mask, scale, affine, weight = [], [], [], [], []
         for number, count in zip(self.numbers, self.texels, strict=True):
@@ -75,7 +76,8 @@ class Case:
             weight.append(random.uniform(0.5, 2.0, (times, 3)))
         f32 = [np.array(values, np.float32) for values in (colour, scale, affine, weight)]
         settings = {name: getattr(self.profile(), name) for name in ("gamma", "metric_weight", "peak")}
-        result = Targets(np.array(self.numbers), f32[0], np.array(mask), f32[1], f32[2], **settings)
+        cut = TileCut(np.array(self.numbers), list(f32[0]), mask)
+        result = Targets(cut, f32[1], f32[2], **settings)
         if self.emphasis != 0.0:
             result.weight, result.emphasis = f32[3], self.emphasis
         return result

@@ -183,20 +183,17 @@ def predict(
     network: Network = None,
     seed: Seed = 0,
 ) -> None:
-    """Predict six-way lightmaps by a coarse ray march: like bake, in less time.
+    """Predict six-way lightmaps by a ray march in large steps: like bake, in less time.
 
-    With --network a network removes the noise of an even coarser march. The files are like those of bake. Finished
-    frames are kept when the command is stopped; repeat it with --resume to make the others.
+    With --network a network removes the noise of a coarse march. The table names the method; the files are like those
+    of bake. Finished frames are kept when the command is stopped; repeat it with --resume to make the others.
     """
     console.quiet_warp()
     from wlm.smoke.codec import open_network
 
-    made: dict[str, Any] = {"made": "coarse", "seed": seed}
-    method: Any = "coarse"
-    if network is not None:
-        method = open_network(network)
-        made |= {"made": "network", "of": dict(method.summary)}
-    write_lightmaps(options, smoke, output, (method, {"seed": seed}), made)
+    method: Any = "coarse" if network is None else open_network(network)
+    made = {"made": "coarse"} if network is None else {"made": "network", "of": dict(method.summary)}
+    write_lightmaps(options, smoke, output, (method, {"seed": seed}), made | {"seed": seed})
 
 
 @app.command()

@@ -253,7 +253,7 @@ def write_lightmaps(
         if resume:
             done = len(files.done)
             note(f"{output}: {done} frames are finished" if done else f"{files.partial}: there is nothing to resume")
-    columns = ["file", "pixels with smoke", "their mean light", *(["largest error of light", "RMS error"] * errors)]
+    columns = ["file", "method", "pixels with smoke", "their mean light", *(["largest error", "RMS error"] * errors)]
     rows = table(str(frames.path), columns)
     numbers = [each for each in frames.numbers if files is None or each not in files.done]
     made: dict[int, tuple[str, ...]] = {}
@@ -278,7 +278,7 @@ def write_lightmaps(
             write_six_way(path, six, looks)
             covered = six.transparency < 0.99
             mean = float(six.lightmaps[:, covered].mean()) if covered.any() else None
-            row = [escape(path.name), f"{float(covered.float().mean()):.1%}", number(mean, ".4g")]
+            row = [escape(path.name), six.method, f"{float(covered.float().mean()):.1%}", number(mean, ".4g")]
             made[frame] = *row, *((f"{six.error.largest:.2g}", f"{six.error.rms:.2g}") if errors else ())
     for frame in sorted(made):
         rows.add_row(*made[frame])

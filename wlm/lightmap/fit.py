@@ -293,7 +293,7 @@ def _classify(
             shift, spread = (chosen.mean(), chosen.std()) if chosen.size else (0.0, 1.0)
             # Half floats end at 6e-8; a channel that is the same everywhere has no spread.
             affine[:, c] = shift, max(spread, 1e-4)
-        largest = encode_scale(colour.max((1, 2)).astype(np.float64), gamma, up=True)
+        largest = encode_scale(colour.max(1).max(1).astype(np.float64), gamma, up=True)
         return _Facts(kind, scale=stored, peak=largest, affine=affine)
 
     facts: list[_Facts] = []

@@ -35,7 +35,7 @@ class Targets:
 
     Attributes:
         number: int [N], numbers of the tiles in their grid.
-        colour: float32 [N, T, 128 * 128, 3], (colour / scale - shift) / spread.
+        colour: float32 [N, T, 128 * 128, 3], (colour / scale - shift) / spread of the valid texels; 0 elsewhere.
         texels: int32 [N, K], flat indices of valid texels, padded to the largest count K.
         count: int32 [N], number of valid texels.
         weight, emphasis: Loss weights, float32 [N, T, 3], and a number, see `wlm_kernels.lightmap.features.Batch`.
@@ -46,9 +46,7 @@ class Targets:
 
     def __init__(
         self,
-        number: np.ndarray,
-        colour: np.ndarray,
-        mask: np.ndarray,
+        tiles: TileCut,
         scale: np.ndarray,
         affine: np.ndarray,
         *,
@@ -56,31 +54,33 @@ class Targets:
         metric_weight: float,
         peak: float | None = None,
     ) -> None:
-        """Normalises and weights gamma-space colours [N, T, 128, 128, 3] where `mask` [N, 128, 128] is true.
+        """Converts the valid texels of N tiles to gamma space, normalises and weights them.
 
         `scale` [N, T, 3] and `affine` [N, 2, 3], which holds shift and spread, are float32, as rounded for the file.
         """
-        n, times = colour.shape[:2]
-        self.number = number.astype(np.int32)
+        n, times = scale.shape[:2]
+        self.number = tiles.index.astype(np.int32)
         self.scale = scale
         self.shift = affine[:, 0].astype(np.float32)
         self.spread = affine[:, 1].astype(np.float32)
         factor = np.divide(1.0, scale, out=np.zeros_like(scale), where=scale > 0)
-        flat = colour.reshape(n, times, TILE * TILE, 3)
-        valid = mask.reshape(n, -1)
-        self.colour = np.empty_like(flat)
-        self.count = valid.sum(1).astype(np.int32)
+        self.colour = np.zeros((n, times, TILE * TILE, 3), np.float32)
+        self.count = np.array([np.count_nonzero(mask) for mask in tiles.mask], np.int32)
         self.texels = np.zeros((n, max(int(self.count.max()), 1)), np.int32)
         self.weight = np.ones((n, times, 3), np.float32)
         self.range = np.zeros((n, times), np.float32)
 
         def fill(i: int) -> None:
-            np.multiply(flat[i], factor[i, :, None], out=self.colour[i])
-            self.colour[i] -= self.shift[i]
-            self.colour[i] /= self.spread[i]
-            self.texels[i, : self.count[i]] = np.flatnonzero(valid[i])
-            values = flat[i][:, valid[i]]
-            span = values.max((1, 2)) ** gamma - values.min((1, 2)) ** gamma  # [T] of linear radiance
+            rows, columns = np.nonzero(tiles.mask[i])
+            at = self.texels[i, : self.count[i]] = rows * TILE + columns
+            values = tiles.light[i][:, tiles.mask[i]]  # [T, K, 3], a copy
+            if gamma != 1.0:
+                np.power(values, np.float32(1.0 / gamma), out=values)
+            span = values.max(1).max(1) ** gamma - values.min(1).min(1) ** gamma  # [T] of linear radiance
+            values *= factor[i, :, None]
+            values -= self.shift[i]
+            values /= self.spread[i]
+            self.colour[i][:, at] = values
             if peak is not None:
                 span = np.full_like(span, peak)
             self.range[i] = span
@@ -109,9 +109,9 @@ class TileJob:
 
     def targets(self) -> Targets:
         """Computes the training data."""
-        tiles, settings = self.tiles.encoded(self.profile.gamma), self.profile
+        settings = self.profile
         options = {"gamma": settings.gamma, "metric_weight": settings.metric_weight, "peak": settings.peak}
-        return Targets(tiles.index, tiles.colour, tiles.mask, self.scale, self.affine, **options)
+        return Targets(self.tiles, self.scale, self.affine, **options)
 
 
 class Trainer:

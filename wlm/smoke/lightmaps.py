@@ -45,6 +45,7 @@ class SixWay:
         depth: float32 tensor [H, W], distance along the ray to the smoke's surface in the world's unit, 0 where there
             is none; None: unknown.
         error: Estimate of the march's error; None: not estimated.
+        method: The method that made them, in words; empty: unknown, as in files.
     """
 
     lightmaps: torch.Tensor
@@ -53,6 +54,7 @@ class SixWay:
     camera: Camera | None = None
     depth: torch.Tensor | None = None
     error: StepError | None = None
+    method: str = ""
 
     def __post_init__(self) -> None:
         if self.lightmaps.ndim != 3 or self.lightmaps.shape[0] != 6:

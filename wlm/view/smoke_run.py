@@ -12,8 +12,8 @@ from wlm.interop import StepGraph
 from wlm.smoke.camera import Camera
 from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.march.launch import in_bricks
-from wlm.smoke.march.six_way import bake_coarse, coarse_march, guide
-from wlm.smoke.network.prediction import SmokePredictor
+from wlm.smoke.march.six_way import guide
+from wlm.smoke.network.prediction import SmokePredictor, predict
 from wlm.smoke.scene import Scene, make_camera
 from wlm.smoke.shading import AnyLight
 from wlm.smoke.simulation import advance, make_solver, volume_of
@@ -26,13 +26,13 @@ from wlm_kernels.smoke.settings import March
 SIMULATION, DRAWING, BYTES = "simulation", "shadows and picture", "bytes"
 """Names of the stages of a frame, besides that of the lighting."""
 
-_SURFACE = March(step=2.0, jitter=0.0)  # march to the surface on which shadows fall, if a network makes the lightmaps
+_SURFACE = March(step=2.0, jitter=0.0)  # march to the surface on which shadows fall, where lightmaps have no depth
 
 
 @dataclass(frozen=True)
 class Lighting:
     """A way to light the smoke of a frame. With an `albedo`, multiple scattering of all lights and of fire; else single
-    scattering by six-way lightmaps, as engines show it, made by a network or, without one, by a coarse march."""
+    scattering by six-way lightmaps, as engines show it, made by `predict` with a network or, without one, a march."""
 
     albedo: Sequence[float] | None = (1.0, 1.0, 1.0)
     network: SmokePredictor | None = None
@@ -47,10 +47,8 @@ class Lighting:
         surface, on which a `Drawing` draws their shadows."""
         if self.albedo is not None:
             return scatter(volume, camera, lights, self.albedo)
-        if self.network is None:
-            return bake_coarse(volume, camera, coarse_march(volume))
-        six = self.network(volume, camera)
-        return replace(six, depth=guide(volume, camera, _SURFACE).depth)
+        six = predict(volume, camera, self.network)
+        return replace(six, depth=guide(volume, camera, _SURFACE).depth) if six.depth is None else six
 
 
 @dataclass

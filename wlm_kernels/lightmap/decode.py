@@ -1,6 +1,6 @@
 """Decodes tiles of a lightmap over time from their stored bytes: BC7 blocks, 8-bit planes and a small MLP.
 
-`exact_kernels` evaluates one texel per thread, in the same order of operations as training. `matrix_decode` is faster,
+`exact_kernel` evaluates one texel per thread, in the same order of operations as training. `matrix_network` is faster,
 on a GPU's matrix units.
 
 Read `benchmarks/lightmap_exact.py` first; it has the same decode in NumPy. `features` describes the maps F_uv to F_vt.
@@ -15,7 +15,6 @@ from wlm_kernels import mlp
 from wlm_kernels.interpolate import axis_index, cell, fraction
 from wlm_kernels.lightmap.blocks import stored_texel
 from wlm_kernels.lightmap.features import CENTRE, INPUTS, MAP_INPUTS
-from wlm_kernels.shared_exponent import pack_rgb9e5
 
 
 @wp.struct
@@ -38,7 +37,6 @@ class TimeState:
     encoding: wp.vec4
     gamma: float
     scale: wp.array1d[wp.vec3]  # [N] mean of each channel at this time
-    inverse_peak: wp.array1d[float]  # [N] 1 / the bound of the tile at this time; 0 for a black one
     shift: wp.array1d[wp.vec3]  # [N]
     spread: wp.array1d[wp.vec3]  # [N]
 
@@ -91,58 +89,16 @@ def stored_volume_at(stored: Stored, n: int, u: float, v: float, tau: float) -> 
 
 
 @wp.func
-def finish_colour(time: TimeState, n: int, y: wp.vec3) -> wp.vec3:
-    """Converts the output y of tile n's network to colour in gamma space, clamped to at least 0."""
-    c = wp.cw_mul(time.shift[n] + wp.cw_mul(time.spread[n], y), time.scale[n])
-    return wp.vec3(wp.max(c[0], 0.0), wp.max(c[1], 0.0), wp.max(c[2], 0.0))
-
-
-@wp.func
 def finish_radiance(time: TimeState, n: int, y: wp.vec3) -> wp.vec3:
-    c = finish_colour(time, n, y)
+    """Converts the output y of tile n's network to linear radiance, at least 0."""
+    c = wp.max(wp.cw_mul(time.shift[n] + wp.cw_mul(time.spread[n], y), time.scale[n]), wp.vec3())
     return wp.vec3(wp.pow(c[0], time.gamma), wp.pow(c[1], time.gamma), wp.pow(c[2], time.gamma))
-
-
-@wp.func
-def pack(v: wp.vec4ub) -> wp.uint32:
-    return (
-        wp.uint32(v[0])
-        | wp.lshift(wp.uint32(v[1]), wp.uint32(8))
-        | wp.lshift(wp.uint32(v[2]), wp.uint32(16))
-        | wp.lshift(wp.uint32(v[3]), wp.uint32(24))
-    )
-
-
-@wp.func
-def finish_byte(c: float, inverse_peak: float) -> wp.uint8:
-    return wp.uint8(int(wp.clamp(c * inverse_peak, 0.0, 1.0) * 255.0 + 0.5))
-
-
-@wp.func
-def bytes_over(colour: wp.vec3, inverse_bound: float) -> wp.uint32:
-    """Packs colour * `inverse_bound`, clamped to [0, 1], as 8-bit RGBA with R in the lowest byte; alpha is 255."""
-    r = finish_byte(colour[0], inverse_bound)
-    g = finish_byte(colour[1], inverse_bound)
-    b = finish_byte(colour[2], inverse_bound)
-    return pack(wp.vec4ub(r, g, b, wp.uint8(255)))
-
-
-@wp.func
-def finish_bytes(time: TimeState, n: int, y: wp.vec3) -> wp.uint32:
-    """Converts the network's output y to 8-bit RGBA: gamma-space colour / the tile's largest colour; alpha is 255."""
-    return bytes_over(finish_colour(time, n, y), time.inverse_peak[n])
-
-
-@wp.func
-def finish_shared(time: TimeState, n: int, y: wp.vec3) -> wp.uint32:
-    """Converts the network's output y to linear radiance packed as RGB9E5."""
-    return pack_rgb9e5(finish_radiance(time, n, y))
 
 
 @functools.cache
 def texel_network(hidden: int, gelu: str) -> Any:
     """Builds (once) the `wp.func` that evaluates the network of tile n at its texel (y, x), for the arguments of
-    `exact_kernels`: network_output(stored, hidden, output, tau, encoding, n, y, x), a vec3. `tau` is the position on
+    `exact_kernel`: network_output(stored, hidden, output, tau, encoding, n, y, x), a vec3. `tau` is the position on
     the time axis, and `encoding`, vec4, the encoded time."""
     net = mlp.kernels(INPUTS, hidden, gelu)
     vec_in, vec_hidden = net.vec_in, net.vec_hidden
@@ -182,39 +138,33 @@ def texel_network(hidden: int, gelu: str) -> Any:
 
 
 @functools.cache
-def exact_kernels(hidden: int, gelu: str) -> tuple[Any, Any, Any]:
-    """Builds (once) three kernels that decode whole tiles, one texel per thread.
+def exact_kernel(hidden: int, gelu: str) -> wp.Kernel:
+    """Builds (once) the kernel that decodes whole tiles, one texel per thread.
 
     Args:
         hidden: H, width of the hidden layers.
         gelu: One of `mlp.GELUS`.
 
     Returns:
-        Kernels that write, in this order, linear radiance as vec3; gamma-space colour as uint32, 8-bit RGBA from the
-        lowest byte; and linear radiance as uint32, RGB9E5. Their inputs are `Stored`; hidden layers, vecH
-        [N, 18 + H]; output layers, vec3 [N, H + 1]; `TimeState`; and int [n], the tiles to
-        decode. Their output is [n, 128, 128].
+        A kernel that writes linear radiance, vec3 [n, 128, 128]. Its inputs are `Stored`; hidden layers, vecH
+        [N, 18 + H]; output layers, vec3 [N, H + 1]; `TimeState`; and int [n], the tiles to decode.
     """
     vec_hidden, network_output = wp.types.vector(hidden, float), texel_network(hidden, gelu)
 
-    def decode_kernel(dtype: Any, finish: Any) -> wp.Kernel:
-        @wp.kernel(module="unique", module_options={"enable_backward": False})
-        def decode(
-            # in:
-            stored: Stored,
-            hidden: wp.array2d[vec_hidden],
-            output: wp.array2d[wp.vec3],
-            time: TimeState,
-            tiles: wp.array1d[int],
-            # out:
-            out: wp.array3d[dtype],
-        ):
-            i, y, x = wp.tid()
-            n = tiles[i]
-            texel = network_output(stored, hidden, output, time.tau, time.encoding, n, y, x)
-            out[i, y, x] = finish(time, n, texel)
+    @wp.kernel(module="unique", module_options={"enable_backward": False})
+    def decode(
+        # in:
+        stored: Stored,
+        hidden: wp.array2d[vec_hidden],
+        output: wp.array2d[wp.vec3],
+        time: TimeState,
+        tiles: wp.array1d[int],
+        # out:
+        out: wp.array3d[wp.vec3],
+    ):
+        i, y, x = wp.tid()
+        n = tiles[i]
+        texel = network_output(stored, hidden, output, time.tau, time.encoding, n, y, x)
+        out[i, y, x] = finish_radiance(time, n, texel)
 
-        return decode
-
-    words = (decode_kernel(wp.uint32, finish) for finish in (finish_bytes, finish_shared))
-    return decode_kernel(wp.vec3, finish_radiance), *words
+    return decode

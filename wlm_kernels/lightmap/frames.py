@@ -7,9 +7,6 @@ high half of a block's 16 little-endian bytes. `wlm.formats.bc7` defines and des
 
 import warp as wp
 
-from wlm_kernels.lightmap.decode import bytes_over
-from wlm_kernels.shared_exponent import pack_rgb9e5
-
 wp.set_module_options({"enable_backward": False})
 
 
@@ -170,8 +167,8 @@ def frame_radiance(stored: StoredFrames, early: int, late: int, share: float, n:
     return light
 
 
-@wp.kernel(module="unique", enable_backward=False)
-def _decode_radiance(
+@wp.kernel
+def _decode(
     # in:
     stored: StoredFrames,
     early: int,
@@ -185,60 +182,13 @@ def _decode_radiance(
     out[i, y, x] = frame_radiance(stored, early, late, share, tiles[i], y, x)
 
 
-@wp.kernel(module="unique", enable_backward=False)
-def _decode_bytes(
-    # in:
-    stored: StoredFrames,
-    early: int,
-    late: int,
-    share: float,
-    tiles: wp.array1d[int],
-    inverse_bounds: wp.array1d[float],
-    # out:
-    out: wp.array3d[wp.uint32],
-):
-    i, y, x = wp.tid()
-    n = tiles[i]
-    if share > 0.0:
-        colour = power(frame_radiance(stored, early, late, share, n, y, x), 1.0 / stored.gamma)
-    else:
-        colour = frame_colour(stored, n * stored.times + early, y, x)
-    out[i, y, x] = bytes_over(colour, inverse_bounds[n])
-
-
-@wp.kernel(module="unique", enable_backward=False)
-def _decode_shared(
-    # in:
-    stored: StoredFrames,
-    early: int,
-    late: int,
-    share: float,
-    tiles: wp.array1d[int],
-    # out:
-    out: wp.array3d[wp.uint32],
-):
-    i, y, x = wp.tid()
-    out[i, y, x] = pack_rgb9e5(frame_radiance(stored, early, late, share, tiles[i], y, x))
-
-
-KERNELS = (_decode_radiance, _decode_bytes, _decode_shared)
-"""The kernels that decode to radiance, to 8-bit RGBA and to RGB9E5."""
-
-
-def decode(stored: StoredFrames, early: int, late: int, share: float, tiles, out, inverse_bounds=None) -> None:
+def decode(stored: StoredFrames, early: int, late: int, share: float, tiles: wp.array, out: wp.array) -> None:
     """Decodes tiles at one time with one kernel launch.
 
     Args:
         stored: The frames.
         early, late, share: Indices of the two frames around the time, and the weight of the later one, 0 to below 1.
         tiles: int [n], the tiles to decode.
-        out: [n, 128, 128], written: linear radiance as vec3 or as uint32 of RGB9E5; with `inverse_bounds` gamma-space
-            colour / the tile's bound, as uint32 of 8-bit RGBA from the lowest byte, alpha 255.
-        inverse_bounds: float [N], 1 / the bound (largest colour) of each tile; 0 for a black tile.
+        out: vec3 [n, 128, 128], written: linear radiance.
     """
-    inputs = [stored, early, late, share, tiles]
-    if inverse_bounds is not None:
-        kernel, inputs = _decode_bytes, [*inputs, inverse_bounds]
-    else:
-        kernel = _decode_shared if out.dtype == wp.uint32 else _decode_radiance
-    wp.launch(kernel, out.shape, inputs=inputs, outputs=[out], device=out.device)
+    wp.launch(_decode, out.shape, inputs=[stored, early, late, share, tiles], outputs=[out], device=out.device)

@@ -9,7 +9,7 @@ From level `COARSE_LEVEL` on, texels are means of a table of `COARSE` x `COARSE`
 that a page of a whole map does not need its tiles. This table is itself decoded by the same kernel (`direct`). A page
 of the level below takes as many samples as `PARTS` others: it is decoded in as many parts, a quarter of its rows each.
 
-Read first: `exact_kernels` in `wlm_kernels/lightmap/decode.py`.
+Read first: `exact_kernel` in `wlm_kernels/lightmap/decode.py`.
 """
 
 import functools
@@ -19,7 +19,7 @@ import warp as wp
 
 from wlm_kernels.lightmap.decode import Stored, texel_network
 from wlm_kernels.lightmap.frames import StoredFrames, frame_colour
-from wlm_kernels.lightmap.matrix_decode import powers
+from wlm_kernels.lightmap.matrix_network import powers
 from wlm_kernels.shared_exponent import pack_rgb9e5, unpack_rgb9e5
 
 COARSE_LEVEL, COARSE = 4, 8

@@ -77,11 +77,6 @@ class Encoding(ABC):
         """
 
 
-def inverse_of(bounds: np.ndarray) -> np.ndarray:
-    """Returns 1 / bound for each bound, float32; 0 where the bound is 0, as for black tiles."""
-    return np.divide(1.0, bounds, out=np.zeros_like(bounds), where=bounds > 0)
-
-
 def columns(count: int, height: int, width: int) -> int:
     """Returns how many images to put in a row so that a texture of `count` images is about as wide as high."""
     return max(int(np.ceil(np.sqrt(count * height / width))), 1)
@@ -96,9 +91,3 @@ def side_by_side(images: np.ndarray, fmt: str, height: int, width: int) -> dict[
     grid = padded.reshape(-1, across, *images.shape[1:]).swapaxes(1, 2)
     data = np.ascontiguousarray(grid).reshape(grid.shape[0] * grid.shape[1], -1, images.shape[-1])
     return {"data": data, "fmt": fmt, "width": across * width, "height": -(-len(images) // across) * height}
-
-
-def rgba(words: Any) -> np.ndarray:
-    """Converts a `wp.array` of RGBA words, uint32 [...], to uint8 [..., 4] on the host."""
-    host = np.ascontiguousarray(words.numpy().astype("<u4"))
-    return host.view(np.uint8).reshape(*host.shape, 4)

@@ -93,7 +93,6 @@ class FrameTiles(DeviceTiles):
         if not len(self.numbers):
             raise WlmError(f"{sheet.name}: expected at least one tile that is stored as frames, found none")
         self._axis, self._device = sheet.axis, device
-        self._greatest = sheet.ranges[:, :, 1].astype(np.float32).max(2)
         ends = sheet.ranges.astype(np.float32).reshape(-1, 2, 3)
         words = np.ascontiguousarray(sheet.frames).view("<u8").reshape(-1, BLOCKS, BLOCKS, 2)
         stored = frame_kernels.StoredFrames()
@@ -105,21 +104,11 @@ class FrameTiles(DeviceTiles):
         self._stored = stored
         self.device_bytes = sum(array.capacity for array in (stored.blocks, stored.least, stored.span))
 
-    def bounds(self, time: float) -> np.ndarray:
-        """Returns an upper bound of each tile's colour at a time, in gamma space, float32 [n]; between two stored times
-        the larger of their bounds."""
-        before, after, share = self._axis.neighbours(time)
-        return self._greatest[:, before] if share == 0 else self._greatest[:, [before, after]].max(1)
-
-    def decode(self, time: float, rows: wp.array, out: wp.array, inverse_bounds: wp.array | None = None) -> None:
+    def decode(self, time: float, rows: wp.array, out: wp.array) -> None:
         """Decodes the tiles `rows`, int [k], indices into `numbers`, with one kernel launch, which a CUDA graph can
-        capture.
-
-        Between two stored times the radiance is interpolated (neural-dynamic-gi, eq. 2). `out`, [k, 128, 128], receives
-        radiance, vec3 or uint32 (RGB9E5); with `inverse_bounds`, float [n], 1 / the bound of each tile, 8-bit colour,
-        uint32 (RGBA).
-        """
-        frame_kernels.decode(self._stored, *self._axis.neighbours(time), rows, out, inverse_bounds)
+        capture. Their radiance is written to `out`, vec3 [k, 128, 128]; between two stored times it is interpolated
+        (neural-dynamic-gi, eq. 2)."""
+        frame_kernels.decode(self._stored, *self._axis.neighbours(time), rows, out)
 
     def radiance(self, rows: np.ndarray, time: float) -> np.ndarray:
         out = wp.empty((len(rows), TILE, TILE), dtype=wp.vec3, device=self._device)

@@ -15,7 +15,7 @@ import warp as wp
 from wlm.bundle import Texture
 from wlm.errors import WlmError
 from wlm.formats.folder import rounded
-from wlm.lightmap.encodings.base import DeviceTiles, Encoding, inverse_of, side_by_side
+from wlm.lightmap.encodings.base import DeviceTiles, Encoding, side_by_side
 from wlm.lightmap.model import SheetModel, decode_scale
 from wlm.lightmap.profile import Profile
 from wlm.lightmap.tiles import TILE, TileKind
@@ -120,10 +120,9 @@ class MapTiles(DeviceTiles):
             raise WlmError(f"{sheet.name}: expected at least one dynamic tile, found none")
         self.model, self._device = sheet, device
         self._axis, self._scale = sheet.axis, sheet.scales
-        self._peak = decode_scale(sheet.peak, profile.gamma)
         affine = np.ascontiguousarray(sheet.affine.astype(np.float32).swapaxes(0, 1))
         self._shift, self._spread = (wp.array(values, dtype=wp.vec3, device=device) for values in affine)
-        self._kernels = decode_kernels.exact_kernels(profile.hidden, gelu)
+        self._kernel = decode_kernels.exact_kernel(profile.hidden, gelu)
 
         def blocks(values: np.ndarray) -> wp.array:
             words = np.ascontiguousarray(values).view("<u8")
@@ -142,12 +141,6 @@ class MapTiles(DeviceTiles):
         self.arguments = (stored, hidden, output)
         self.device_bytes = sum(array.capacity for array in (*maps.values(), hidden, output))
 
-    def bounds(self, time: float) -> np.ndarray:
-        """Returns the gamma-space colour that byte 255 of each tile stands for at a time, float32 [n]; between two
-        stored times the larger one."""
-        before, after, share = self._axis.neighbours(time)
-        return self._peak[:, before] if share == 0 else np.maximum(self._peak[:, before], self._peak[:, after])
-
     def state(self, time: float, state: decode_kernels.TimeState | None = None) -> decode_kernels.TimeState:
         """Returns a time's position, encoding and tile scales for the decode kernels, in `state` unless it is None."""
         before, after, share = self._axis.neighbours(time)
@@ -155,35 +148,24 @@ class MapTiles(DeviceTiles):
             state = decode_kernels.TimeState()
             state.gamma, state.shift, state.spread = self.model.profile.gamma, self._shift, self._spread
             state.scale = wp.empty_like(self._shift)
-            state.inverse_peak = wp.empty(len(self.numbers), dtype=float, device=self._device)
         scale = (1.0 - share) * self._scale[:, before] + share * self._scale[:, after]
         state.scale.assign(scale.astype(np.float32))
-        state.inverse_peak.assign(inverse_of(self.bounds(time)))
         state.tau, state.encoding = self._axis.place(time), wp.vec4(*self._axis.encode(time))
         return state
 
-    def launch(self, state: decode_kernels.TimeState, rows: wp.array, form: int, out: wp.array) -> None:
+    def launch(self, state: decode_kernels.TimeState, rows: wp.array, out: wp.array) -> None:
         """Decodes the tiles `rows`, int [k], indices into `numbers`, in the training's order of operations, one thread
-        per texel.
-
-        `form` is the output written to `out`, [k, 128, 128]: 0 for radiance (vec3), 1 for 8-bit RGBA (uint32), 2 for
-        RGB9E5 (uint32).
-        """
-        wp.launch(
-            self._kernels[form], out.shape, inputs=[*self.arguments, state, rows], outputs=[out], device=self._device
-        )
-
-    def _decoded(self, rows: np.ndarray, time: float, form: int) -> wp.array:
-        dtype = wp.uint32 if form else wp.vec3
-        out = wp.empty((len(rows), TILE, TILE), dtype=dtype, device=self._device)
-        self.launch(self.state(time), wp.array(rows, dtype=int, device=self._device), form, out)
-        return out
+        per texel. Their radiance is written to `out`, vec3 [k, 128, 128]."""
+        wp.launch(self._kernel, out.shape, inputs=[*self.arguments, state, rows], outputs=[out], device=self._device)
 
     def radiance(self, rows: np.ndarray, time: float) -> np.ndarray:
-        reads = self._axis.reads(time)
-        if len(reads) == 1:
-            return self._decoded(rows, reads[0][0], 0).numpy()
-        return sum(np.float32(share) * self._decoded(rows, stamp, 0).numpy() for stamp, share in reads)
+        reads, chosen = self._axis.reads(time), wp.array(rows, dtype=int, device=self._device)
+        out = wp.empty((len(rows), TILE, TILE), dtype=wp.vec3, device=self._device)
+        total = np.float32(0.0)
+        for stamp, share in reads:
+            self.launch(self.state(stamp), chosen, out)
+            total = total + np.float32(share) * out.numpy()
+        return total
 
 
 # ---- textures, networks and tables of the shader ----

@@ -70,7 +70,7 @@ def bake(
                 float(difference[march_six.TRANSPARENCY].abs().max()),
             )
     hot = fine[march_six.EMISSION] if volume.temperature is not None else None
-    return SixWay(fine[:6], fine[march_six.TRANSPARENCY], hot, camera, error=error)
+    return SixWay(fine[:6], fine[march_six.TRANSPARENCY], hot, camera, None, error, f"fine march, step {step:g}")
 
 
 def _planes(volume: DensityVolume, camera: Camera, march: March, supersample: int) -> torch.Tensor:
@@ -96,7 +96,8 @@ def bake_coarse(volume: DensityVolume, camera: Camera, march: March = March()) -
     """
     planes = march_planes(volume, camera, march)
     hot = planes[_EMISSION] if volume.temperature is not None else None
-    return SixWay(planes[: len(DIRECTIONS)], planes[_TRANSPARENCY], hot, camera, planes[marches.DEPTH])
+    light, method = planes[: len(DIRECTIONS)], f"coarse march, step {march.step:.3g}"
+    return SixWay(light, planes[_TRANSPARENCY], hot, camera, planes[marches.DEPTH], method=method)
 
 
 def coarse_march(volume: DensityVolume, seed: int = 0) -> March:
@@ -113,25 +114,21 @@ def march_planes(volume: DensityVolume, camera: Camera, march: March) -> torch.T
 @dataclass(frozen=True, eq=False)
 class Guide:
     """A guiding map of H x W pixels (algorithm 1): a cheap picture of smoke, from which a network predicts lightmaps.
-    `maps`, float32 tensor [3, H, W] on the smoke's device, are light, transparency and depth, seen by `camera`."""
+
+    Attributes:
+        maps: float32 tensor [3, H, W] on the smoke's device: light, transparency and depth.
+        camera: The camera that sees them.
+        light: Light scattered to the camera from three lights of irradiance 4 pi: at the front, top and bottom, [H, W].
+        transparency: Transparency of the smoke, 0 to 1, [H, W]: 1 where there is no smoke.
+        depth: Distance along the ray to the smoke in world units, [H, W]: 0 where there is no smoke.
+    """
 
     maps: torch.Tensor
     camera: Camera
 
-    @property
-    def light(self) -> torch.Tensor:
-        """Light scattered to the camera, [H, W], from three lights of irradiance 4 pi: at the front, top and bottom."""
-        return self.maps[0]
-
-    @property
-    def transparency(self) -> torch.Tensor:
-        """Transparency of the smoke, 0 to 1, [H, W]: 1 where there is no smoke."""
-        return self.maps[1]
-
-    @property
-    def depth(self) -> torch.Tensor:
-        """Distance along the ray to the smoke in world units, [H, W]: 0 where there is no smoke."""
-        return self.maps[2]
+    light = property(lambda self: self.maps[0])
+    transparency = property(lambda self: self.maps[1])
+    depth = property(lambda self: self.maps[2])
 
 
 def guide(volume: DensityVolume, camera: Camera, march: March = March(), *, shared: bool = True) -> Guide:

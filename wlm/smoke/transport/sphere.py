@@ -57,7 +57,7 @@ def bake_sphere(
             made, back = (scatter(volume, camera, each, grey, march=march) for each in (lamps, opposite))
             lit, sums = made.lit, _sums(both[0], made.planes[..., 0]) + _sums(both[1], back.planes[..., 0])
         maps = _not_negative(both.flatten(0, 1).T @ both.flatten(0, 1), sums)
-    return SixWay(maps, lit.transparency, lit.emission, camera, lit.depth)
+    return SixWay(maps, lit.transparency, lit.emission, camera, lit.depth, method="march, best for all sides")
 
 
 def _sums(weigh: torch.Tensor, planes: torch.Tensor) -> torch.Tensor:
