@@ -85,7 +85,7 @@ def bake_coarse(volume: DensityVolume, camera: Camera, march: March = March()) -
         volume: The smoke.
         camera: Orthographic.
         march: Settings. Nodes of the lattice that stores optical depths to the lights are at least a quarter of a voxel
-            apart, and farther apart if there would be more than 2^28 nodes; a node takes 32 bytes. There are 64
+            apart, and farther apart if there would be more than 2^28 nodes; a node takes 10 bytes. There are 64
             different seeds of the jitter, which is gradient noise.
 
     Returns:
