@@ -133,7 +133,8 @@ def _reason(figures: Mapping[str, float], stalls: Mapping[str, float], registers
 def _profiled(ncu: str, name: str, device: str) -> list[dict[str, str]]:
     """Runs a case in a process of its own under the profiler, and returns its launches."""
     metrics = [_TIME, _REGISTERS, *_FIGURES.values(), *map(_column, _STALLS)]
-    command = [ncu, "--clock-control", "none", "--cache-control", "none", "--profile-from-start", "off", "--launch-count", str(_LAUNCHES)]
+    command = [ncu, "--clock-control", "none", "--cache-control", "none", "--profile-from-start", "off"]
+    command += ["--launch-count", str(_LAUNCHES)]
     command += ["--metrics", ",".join(metrics), "--csv", "--page", "raw", "--print-units", "base"]
     command += [sys.executable, "-m", "benchmarks.kernels_profile", name, device]
     try:
