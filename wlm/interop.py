@@ -20,7 +20,6 @@ _TENSORS = {
     wp.int64: (torch.int64, ()),
     wp.float16: (torch.float16, ()),
     wp.vec2: (torch.float32, (2,)),
-    wp.vec2h: (torch.float16, (2,)),
     wp.vec4: (torch.float32, (4,)),
 }
 """Torch representation of Warp types: the torch type and the length of the last axis."""

@@ -81,7 +81,7 @@ def _probe_network(shape: tuple[int, int, int]) -> list:
 def _smoke(dtype: type) -> list:
     """Builds all kernels that take smoke, for densities of one type."""
     smoke = smoke_march.smoke_struct(dtype, True)
-    variants = {"_guide": (True,), "_coarse": (dtype is wp.float16,)}
+    variants = {"_guide": (True,), "_coarse": (dtype is wp.float16,), "_measure": (2,)}
     built = [smoke_path._coarser, *map(depth_lattice._add_up, BOTH)]
     for module in (smoke_march, marches, march_six, depth_lattice, diffusion, smoke_path):
         # Functions of Warp have a `build`, too.

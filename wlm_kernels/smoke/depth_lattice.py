@@ -4,8 +4,8 @@ For a light at infinity the lattice has lines that run towards the light. The op
 nodes of a line is marched once; sums along the line from both of its ends are the depths to the light and to the
 opposite light. This takes as many samples as there are nodes, where a march from each node would take a line of
 samples per node. A lattice has one pair of opposite lights along its first axis, or two pairs along its first and
-second axes, which share samples at the nodes. The lattice of a point light follows the grid's axes, and each node
-marches to the light separately, since no two of its rays are parallel.
+second axes. The lattice of a point light follows the grid's axes, and each node marches to the light separately, since
+no two of its rays are parallel.
 
 Units and sampling are those of `march`.
 """
@@ -36,14 +36,13 @@ voxels."""
 
 _MOST_MARCHING = 2**24  # largest number of nodes of a point light, each of which marches separately
 _AT_ONCE = wp.constant(8)  # nodes of a line that a thread sums at a time
-_NODES = wp.constant(4)  # nodes that a thread samples
 _LEAST_SPACING = 0.25  # voxels between nodes
-_DEEPEST = wp.constant(60000.0)  # largest extinction and depth, within the range of half floats
+_DEEPEST = wp.constant(60000.0)  # largest optical depth between nodes, within the range of half floats
 _NEVER = wp.constant(1.0e30)
 _DARK = wp.constant(6.0)  # optical depth of an obstacle: a larger one would widen shadows between nodes
 _ROUNDING = 1e-6  # relative excess of a part over the step that is tolerated, so that rounding adds no part
 
-_Several = wp.types.vector(length=int(_AT_ONCE) + 1, dtype=float)
+_Several = wp.types.vector(length=int(_AT_ONCE), dtype=float)
 
 
 @wp.struct
@@ -70,7 +69,7 @@ def axis(lattice: Lattice, n: int) -> wp.vec3:
 
 
 @wp.func
-def depths_at(nodes: wp.array3d[wp.vec2h], lattice: Lattice, p: wp.vec3) -> wp.vec2:
+def depths_at(nodes: wp.array3d[wp.vec2], lattice: Lattice, p: wp.vec3) -> wp.vec2:
     """Interpolates optical depths to the light and to the opposite light trilinearly between nodes."""
     inverse = wp.vec3(1.0 / lattice.gap[0], 1.0 / lattice.gap[1], 1.0 / lattice.gap[2])
     return between_nodes(nodes, wp.cw_mul(lattice.axes * (p - lattice.origin) - lattice.low, inverse))
@@ -83,101 +82,98 @@ def _node(lattice: Lattice, i: int, j: int, k: int) -> wp.vec3:
 
 
 @wp.func
-def _on_line(pair: int, line: int, n: int, k: int) -> wp.vec3i:
-    """Returns the indices of the n-th node of a line along the first axis (pair 0) or along the second one."""
-    return wp.vec3i(wp.where(pair == 0, n, line), wp.where(pair == 0, line, n), k)
+def _lit_way(solid: Solid, end: wp.vec4i, lattice: Lattice, toward: wp.vec3) -> float:
+    """Computes how far from the end of a line its nodes are lit by a light beyond the end; negative: nowhere."""
+    p = _node(lattice, end[1], end[2], end[3])
+    if way_to_solid(solid, p, toward) < _NEVER:
+        return -1.0
+    # A gap more, since light is interpolated between nodes: else the lit side of an obstacle would be dark.
+    return way_to_solid(solid, p, -toward) + wp.length(wp.cw_mul(lattice.axes * toward, lattice.gap))
 
 
 @wp.func
-def _stored(depth: float) -> wp.float16:
-    return wp.float16(wp.min(depth, _DEEPEST))
+def _on_line(pair: int, line: int, n: int, k: int) -> wp.vec4i:
+    """Returns the indices of the n-th node of a line along the first axis (pair 0) or along the second one."""
+    return wp.vec4i(pair, wp.where(pair == 0, n, line), wp.where(pair == 0, line, n), k)
 
 
+# With obstacles in the way the kernel has far more registers.
 @functools.cache
 def _add_up(with_solid: bool) -> wp.Kernel:
     @wp.kernel(module="unique", module_options=OPTIONS)
     def kernel(
         # in:
-        extinctions: wp.array3d[wp.float16],
+        gaps: wp.array4d[wp.float16],
         lattice: Lattice,
         solid: Solid,
-        share: float,
         # out:
-        nodes: wp.array4d[wp.vec2h],
+        nodes: wp.array4d[wp.vec2],
     ):
-        """Sums optical depths from each node of a line to its last node (end 0), beyond which the light is, or to the
-        first one (end 1). The extinction between two nodes is that of the first, and of the second by `share`."""
-        both, line, k = wp.tid()
-        pair = both // 2
-        end = both % 2
+        """Sums optical depths from each node of a line to both of its ends; the light is beyond the last node."""
+        pair, line, k = wp.tid()
         last = wp.where(pair == 0, nodes.shape[1], nodes.shape[2]) - 1
         if line >= wp.where(pair == 0, nodes.shape[2], nodes.shape[1]):
             return
-        gap = wp.where(pair == 0, lattice.gap[0], lattice.gap[1])
-        # Nodes farther from the end than `lit` are in the shadow of obstacles.
+        # Nodes farther from the last node, and from the first one, are in the shadow of obstacles.
         lit = float(_NEVER)
+        opposite = float(_NEVER)
         if wp.static(with_solid):
-            q = _on_line(pair, line, wp.where(end == 0, last, 0), k)
-            p = _node(lattice, q[0], q[1], q[2])
-            toward = wp.where(end == 0, 1.0, -1.0) * axis(lattice, pair)
-            lit = -1.0
-            if way_to_solid(solid, p, toward) >= _NEVER:
-                # A gap more, since light is interpolated between nodes: else the lit side of an obstacle would be dark.
-                lit = way_to_solid(solid, p, -toward) / gap + 1.0
-        # The extinction between nodes is that of the first one: seen from end 1, of the node before.
-        beside = wp.where(end == 0, 1.0 - share, share)
-        depth = float(0.0)
-        before = float(0.0)
-        # Several nodes at a time, since loads wait for earlier stores.
+            gap = wp.where(pair == 0, lattice.gap[0], lattice.gap[1])
+            lit = _lit_way(solid, _on_line(pair, line, last, k), lattice, axis(lattice, pair)) / gap
+            opposite = _lit_way(solid, _on_line(pair, line, 0, k), lattice, -axis(lattice, pair)) / gap
+        # In double precision, since the depth ahead is a difference. Several nodes at a time, since loads wait for
+        # earlier stores.
+        ahead = wp.float64(0.0)
+        for n in range(last):
+            q = _on_line(pair, line, n, k)
+            ahead += wp.float64(gaps[q[0], q[1], q[2], q[3]])
+        behind = wp.float64(0.0)
         for begin in range(0, last + 1, _AT_ONCE):
             several = _Several()
-            for m in range(_AT_ONCE + 1):
-                if begin + m <= last:
-                    q = _on_line(pair, line, wp.where(end == 0, last - begin - m, begin + m), k)
-                    several[m] = gap * float(extinctions[q[0], q[1], q[2]])
+            for m in range(_AT_ONCE):
+                if begin + m < last:
+                    q = _on_line(pair, line, begin + m, k)
+                    several[m] = float(gaps[q[0], q[1], q[2], q[3]])
             for m in range(_AT_ONCE):
                 n = begin + m
                 if n <= last:
-                    if n > 0:
-                        depth += wp.lerp(before, several[m], beside)
-                    # The trapezoidal rule, with the correction for the slope at its end.
-                    through = wp.max(depth - share * (several[m + 1] - before) / 12.0, 0.0)
-                    before = several[m]
-                    q = _on_line(pair, line, wp.where(end == 0, last - n, n), k)
-                    nodes[pair, q[0], q[1], q[2]][end] = _stored(through + wp.where(float(n) > lit, _DARK, 0.0))
+                    q = _on_line(pair, line, n, k)
+                    a = float(ahead) + wp.where(float(last - n) > lit, _DARK, 0.0)
+                    b = float(behind) + wp.where(float(n) > opposite, _DARK, 0.0)
+                    nodes[q[0], q[1], q[2], q[3]] = wp.vec2(a, b)
+                    ahead -= wp.float64(several[m])
+                    behind += wp.float64(several[m])
 
     return kernel
 
 
 @for_smoke
-def _measure(smoke_type: Any) -> wp.Kernel:
+def _measure(smoke_type: Any, pairs: int) -> wp.Kernel:
     @wp.kernel(module="unique", module_options=OPTIONS)
     def kernel(
         # in:
         smoke: smoke_type,
         lattice: Lattice,
-        parts: int,
+        parts: wp.vec2i,
         # out:
-        extinctions: wp.array3d[wp.float16],
+        gaps: wp.array4d[wp.float16],
     ):
-        """Computes the extinction at a node or, if there are `parts`, its mean over parts of the way to the next."""
-        i, j, several = wp.tid()
+        """Computes the optical depth from a node to the next node along the axis of each pair of opposite lights."""
+        i, j, k = wp.tid()
+        begin = _node(lattice, i, j, k)
         size = box_of(smoke)
-        # To find its indices takes a thread longer than a node outside the smoke.
-        for m in range(_NODES):
-            k = several * _NODES + m
-            if k < extinctions.shape[2]:
-                begin = _node(lattice, i, j, k)
-                total = float(0.0)
-                for n in range(wp.max(parts, 1)):
-                    p = begin
-                    if parts > 0:
-                        p += (float(n) + 0.5) * lattice.gap[0] / float(parts) * axis(lattice, 0)
+        for pair in range(wp.static(pairs)):
+            tau = float(0.0)
+            if wp.where(pair == 0, i, j) < wp.where(pair == 0, gaps.shape[1], gaps.shape[2]) - 1:
+                along = axis(lattice, pair)
+                d = lattice.gap[pair] / float(parts[pair])
+                for n in range(parts[pair]):
+                    p = begin + (float(n) + 0.5) * d * along
                     # Nodes of a rotated lattice may lie far outside the grid.
                     low = wp.min(p) >= -0.5
                     if low and p[0] <= size[0] + 0.5 and p[1] <= size[1] + 0.5 and p[2] <= size[2] + 0.5:
-                        total += sample(smoke, p)
-                extinctions[i, j, k] = _stored(total * smoke.extinction / float(wp.max(parts, 1)))
+                        tau += d * sample(smoke, p)
+            gaps[pair, i, j, k] = wp.float16(wp.min(smoke.extinction * tau, _DEEPEST))
 
     return kernel
 
@@ -191,7 +187,7 @@ def _reach(smoke_type: Any) -> wp.Kernel:
         lattice: Lattice,
         step: float,
         # out:
-        nodes: wp.array3d[wp.vec2h],
+        nodes: wp.array3d[wp.vec2],
     ):
         i, j, k = wp.tid()
         p = _node(lattice, i, j, k)
@@ -208,11 +204,11 @@ def _reach(smoke_type: Any) -> wp.Kernel:
                 tau += d * sample(smoke, p + (first + (float(n) + 0.5) * d) * toward)
         tau = smoke.extinction * tau
         if smoke.solid.mesh != wp.uint64(0):
-            # As far from the lit side of an obstacle as a gap, light still falls: see `_add_up`.
+            # As far from the lit side of an obstacle as a gap, light still falls: see `_lit_way`.
             skipped = wp.max(lattice.gap)
             if skipped + way_to_solid(smoke.solid, p + skipped * toward, toward) < away:
                 tau += _DARK
-        nodes[i, j, k] = wp.vec2h(_stored(tau), wp.float16(0.0))
+        nodes[i, j, k] = wp.vec2(tau, 0.0)
 
     return kernel
 
@@ -254,15 +250,15 @@ def add_up(medium: Medium, lattice: Lattice, counts: Sequence[int], pairs: int, 
     """Computes the optical depths from the nodes of a lattice of `make_lattice` to one or two `pairs` of opposite
     lights at infinity: at both ends of the lattice's first axis, and of its second.
 
-    `step` is the longest step between two nodes of one pair, in voxels; those of two pairs are one step apart. Returns
-    vec2h [pairs, X, Y, Z] for each node: depths to the light at the axis's end and to the light at its start.
+    `step` is the longest step between two nodes, in voxels. Returns vec2 [pairs, X, Y, Z] for each node: depths
+    to the light at the axis's end and to the light at its start.
     """
-    extinctions, nodes = medium.buffer(tuple(counts), wp.float16), medium.buffer((pairs, *counts), wp.vec2h)
-    parts = parts_of(lattice.gap[0], step) if pairs == 1 else 0
-    _measure(medium, (*counts[:2], -(-counts[2] // int(_NODES))), [lattice, parts], [extinctions])
+    parts = wp.vec2i(*(parts_of(lattice.gap[n], step) for n in range(2)))
+    gaps, nodes = (medium.buffer((pairs, *counts), dtype) for dtype in (wp.float16, wp.vec2))
+    _measure(medium, tuple(counts), [lattice, parts], [gaps], pairs)
     lines = max(counts[:2]) if pairs == 2 else counts[1]
-    inputs = [extinctions, lattice, medium.solid or Solid(), 0.5 * (pairs - 1)]
-    wp.launch(_add_up(medium.solid is not None), (2 * pairs, lines, counts[2]), inputs, [nodes], device=medium.device)
+    inputs = [gaps, lattice, medium.solid or Solid()]
+    wp.launch(_add_up(medium.solid is not None), (pairs, lines, counts[2]), inputs, [nodes], device=medium.device)
     return nodes
 
 
@@ -271,7 +267,7 @@ def reach(medium: Medium, place: Sequence[float], radius: float | None, march: M
     or the position of a point light in voxels with a radius in voxels, within which its irradiance is constant.
 
     Of `march` only the spacing is used, or the step; the lattice of a point light has at most 2^24 nodes. Returns a
-    lattice, and vec2h [X, Y, Z] at its nodes: depths to the light and to the opposite light, for a point light 0.
+    lattice, and vec2 [X, Y, Z] at its nodes: depths to the light and to the opposite light, for a point light 0.
     """
     spacing, shape = march.spacing or march.step, medium.shape
     if radius is None:
@@ -279,7 +275,7 @@ def reach(medium: Medium, place: Sequence[float], radius: float | None, march: M
         return lattice, add_up(medium, lattice, counts, 1, spacing).reshape(counts)
     lattice, counts = make_lattice(shape, ((1, 0, 0), (0, 1, 0), (0, 0, 1)), spacing, most=_MOST_MARCHING)
     lattice.place, lattice.point, lattice.radius = wp.vec3(*place), 1, float(radius)
-    nodes = medium.buffer(counts, wp.vec2h)
+    nodes = medium.buffer(counts, wp.vec2)
     _reach(medium, counts, [lattice, spacing], [nodes])
     return lattice, nodes
 

@@ -326,7 +326,7 @@ def _stop(smoke_type: Any) -> wp.Kernel:
     def kernel(
         # in:
         smoke: smoke_type,
-        nodes: wp.array3d[wp.vec2h],
+        nodes: wp.array3d[wp.vec2],
         lattice: Lattice,
         cell: wp.vec3,
         parts: wp.vec3i,

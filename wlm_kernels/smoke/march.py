@@ -54,26 +54,23 @@ class Solid:
     stop: wp.array2d[float]
 
 
-_FOUND = """
+_ANY = """
     const auto* voxels = &wp::index(field, i, j, k);
 #if defined(__CUDA_ARCH__)
     // A warp reads memory fastest by 16 bytes a thread.
-    constexpr int parts = sizeof(*voxels) / 2, narrow = sizeof(*voxels) == 2 ? 16 : 0;
     if (count == 8 && field.strides[2] == sizeof(*voxels) && reinterpret_cast<size_t>(voxels) % 16 == 0) {
-        uint4 part[parts];
         unsigned any = 0;
-        for (int n = 0; n < parts; ++n) {
-            part[n] = __ldg(reinterpret_cast<const uint4*>(voxels) + n);
-            any |= part[n].x | part[n].y | part[n].z | part[n].w;
+        for (int n = 0; n < sizeof(*voxels) / 2; ++n) {
+            const uint4 part = __ldg(reinterpret_cast<const uint4*>(voxels) + n);
+            any |= part.x | part.y | part.z | part.w;
         }
-        return (any != 0) | (part[0].x << narrow != 0) << 1 | (part[parts - 1].w >> narrow != 0) << 2;
+        return any != 0;
     }
 #endif
-    int found = 0;
     for (int n = 0; n < count; ++n)
         if (static_cast<float>(wp::index(field, i, j, k + n)) > 0.0f)
-            found |= 1 | (n == 0) << 1 | (n == 7) << 2;
-    return found;
+            return true;
+    return false;
 """
 
 
@@ -316,53 +313,13 @@ def box_of(smoke: Any) -> wp.vec3:
 
 
 @wp.func
+def _voxel(field: wp.array3d[Any], places: int, i: int, j: int, k: int) -> float:
+    return float(field[i, j, k])
+
+
+@wp.func
 def _voxel(field: wp.array3d[Any], places: wp.array3d[int], i: int, j: int, k: int) -> float:
     return float(field[BRICK * places[i // BRICK, j // BRICK, k // BRICK] + i % BRICK, j % BRICK, k % BRICK])
-
-
-# A thread waits for each instruction that loads, and an aligned one loads four voxels at once.
-_PAIR = """
-    const auto* voxel = &wp::index(field, i, j, k);
-#if defined(__CUDA_ARCH__)
-    if (after == k + 1 && field.strides[2] == sizeof(*voxel)) {
-        const unsigned at = reinterpret_cast<size_t>(voxel) / sizeof(*voxel) & 3;
-        %s
-    }
-#endif
-    return wp::vec2f(static_cast<float>(*voxel), static_cast<float>(wp::index(field, i, j, after)));
-"""
-
-
-@wp.func_native(
-    _PAIR
-    % """const float4 four = __ldg(reinterpret_cast<const float4*>(voxel - at));
-        return wp::vec2f(at == 0 ? four.x : at == 1 ? four.y : at == 2 ? four.z : four.w,
-                         at == 0 ? four.y : at == 1 ? four.z : at == 2 ? four.w : __ldg(voxel + 1));"""
-)
-def _along_z(field: wp.array3d[wp.float32], i: int, j: int, k: int, after: int) -> wp.vec2: ...
-
-
-@wp.func_native(
-    _PAIR
-    % """const uint2 four = __ldg(reinterpret_cast<const uint2*>(voxel - at));
-        const unsigned long long bits = four.x | static_cast<unsigned long long>(four.y) << 32;
-        wp::half low, high;
-        low.u = bits >> 16 * at;
-        high.u = at < 3 ? bits >> 16 * (at + 1) : voxel[1].u;
-        return wp::vec2f(static_cast<float>(low), static_cast<float>(high));"""
-)
-def _along_z(field: wp.array3d[wp.float16], i: int, j: int, k: int, after: int) -> wp.vec2: ...
-
-
-@wp.func
-def _two(field: wp.array3d[Any], places: int, i: int, j: int, k: int, after: int) -> wp.vec2:
-    """Returns two voxels along z."""
-    return _along_z(field, i, j, k, after)
-
-
-@wp.func
-def _two(field: wp.array3d[Any], places: wp.array3d[int], i: int, j: int, k: int, after: int) -> wp.vec2:
-    return wp.vec2(_voxel(field, places, i, j, k), _voxel(field, places, i, j, after))
 
 
 @wp.func
@@ -393,25 +350,19 @@ def density_at(field: wp.array3d[Any], smoke: Any, p: wp.vec3) -> float:
     j1 = wp.clamp(j + 1, 0, ny - 1)
     k0 = wp.clamp(k, 0, nz - 1)
     k1 = wp.clamp(k + 1, 0, nz - 1)
-    wz = wp.vec2(wz0, wz1)
-    a = wy0 * wp.dot(wz, _two(field, smoke.places, i0, j0, k0, k1))
-    a += wy1 * wp.dot(wz, _two(field, smoke.places, i0, j1, k0, k1))
-    b = wy0 * wp.dot(wz, _two(field, smoke.places, i1, j0, k0, k1))
-    b += wy1 * wp.dot(wz, _two(field, smoke.places, i1, j1, k0, k1))
+    a = wy0 * (wz0 * _voxel(field, smoke.places, i0, j0, k0) + wz1 * _voxel(field, smoke.places, i0, j0, k1))
+    a += wy1 * (wz0 * _voxel(field, smoke.places, i0, j1, k0) + wz1 * _voxel(field, smoke.places, i0, j1, k1))
+    b = wy0 * (wz0 * _voxel(field, smoke.places, i1, j0, k0) + wz1 * _voxel(field, smoke.places, i1, j0, k1))
+    b += wy1 * (wz0 * _voxel(field, smoke.places, i1, j1, k0) + wz1 * _voxel(field, smoke.places, i1, j1, k1))
     return wx0 * a + wx1 * b
-
-
-# Addresses from Warp's 64-bit strides would take twice as long.
-@wp.func_native("return bricks.data[b];")
-def _brick(bricks: wp.array3d[wp.uint8], b: int) -> wp.uint8: ...
 
 
 @wp.func
 def _has_smoke(bricks: wp.array3d[wp.uint8], p: wp.vec3) -> bool:
-    i = wp.clamp(int(p[0]) >> 3, 0, bricks.shape[0] - 1)
-    j = wp.clamp(int(p[1]) >> 3, 0, bricks.shape[1] - 1)
-    k = wp.clamp(int(p[2]) >> 3, 0, bricks.shape[2] - 1)
-    return _brick(bricks, (i * bricks.shape[1] + j) * bricks.shape[2] + k) != wp.uint8(0)
+    i = wp.clamp(int(p[0]) // BRICK, 0, bricks.shape[0] - 1)
+    j = wp.clamp(int(p[1]) // BRICK, 0, bricks.shape[1] - 1)
+    k = wp.clamp(int(p[2]) // BRICK, 0, bricks.shape[2] - 1)
+    return bricks[i, j, k] != wp.uint8(0)
 
 
 @wp.func
@@ -428,17 +379,6 @@ def sample(smoke: Any, p: wp.vec3) -> float:
 
 
 @wp.func
-def _full(value: Any):
-    """Returns a value of an array in single precision."""
-    return value
-
-
-@wp.func
-def _full(value: wp.vec2h):
-    return wp.vec2(float(value[0]), float(value[1]))
-
-
-@wp.func
 def between_nodes(nodes: wp.array3d[Any], q: wp.vec3):
     """Interpolates an array trilinearly at the index q, which may have fractions; q is clamped to the array."""
     x = wp.clamp(q[0], 0.0, float(nodes.shape[0] - 1))
@@ -452,10 +392,8 @@ def between_nodes(nodes: wp.array3d[Any], q: wp.vec3):
     k1 = wp.min(k + 1, nodes.shape[2] - 1)
     fy = y - float(j)
     fz = z - float(k)
-    near = wp.lerp(_full(nodes[i, j, k]), _full(nodes[i, j, k1]), fz)
-    near = wp.lerp(near, wp.lerp(_full(nodes[i, j1, k]), _full(nodes[i, j1, k1]), fz), fy)
-    far = wp.lerp(_full(nodes[i1, j, k]), _full(nodes[i1, j, k1]), fz)
-    far = wp.lerp(far, wp.lerp(_full(nodes[i1, j1, k]), _full(nodes[i1, j1, k1]), fz), fy)
+    near = wp.lerp(wp.lerp(nodes[i, j, k], nodes[i, j, k1], fz), wp.lerp(nodes[i, j1, k], nodes[i, j1, k1], fz), fy)
+    far = wp.lerp(wp.lerp(nodes[i1, j, k], nodes[i1, j, k1], fz), wp.lerp(nodes[i1, j1, k], nodes[i1, j1, k1], fz), fy)
     return wp.lerp(near, far, x - float(i))
 
 
@@ -526,19 +464,13 @@ def _at_once() -> int: ...
 
 @wp.func
 def look(r: Ray, smoke: Any) -> Ray:
-    """Samples the smoke in the ray's current step, or passes steps of cold air to a later one: sets the step's
-    `distance`, `place`, `sigma` and `x`. Steps must follow one another from step 0."""
+    """Samples the smoke in the ray's current step: sets the step's `distance`, `place`, `sigma` and `x`. Steps must
+    follow one another from step 0."""
     if r.done % _at_once() == 0:
         some = bool(False)
-        while not some:
-            for n in range(_AHEAD):
-                if n < _at_once():
-                    some = _has_smoke(smoke.bricks, point_on(r, r.done + n, r.offset)) or some
-            if not some:
-                # Air without smoke emits light where it is hot.
-                if smoke.emission > 0.0 or r.done + _at_once() >= r.count:
-                    break
-                r.done += _at_once()
+        for n in range(_AHEAD):
+            if n < _at_once():
+                some = _has_smoke(smoke.bricks, point_on(r, r.done + n, r.offset)) or some
         r.ahead = _Several()
         if some:
             for n in range(_AHEAD):
@@ -625,56 +557,51 @@ def _start(places: wp.array3d[int], i: int, j: int, c: int) -> wp.vec3i:
 
 
 @for_smoke
-def _squares(smoke_type: Any) -> wp.Kernel:
+def _runs(smoke_type: Any) -> wp.Kernel:
     density = smoke_type.vars["density"].type
 
-    @wp.func_native(_FOUND)
-    def found_in(field: density, i: int, j: int, k: int, count: int) -> int: ...
+    @wp.func_native(_ANY)
+    def holds_any(field: density, i: int, j: int, k: int, count: int) -> bool: ...
 
     @wp.kernel(module="unique", module_options=OPTIONS)
     def kernel(
         # in:
         smoke: smoke_type,
         # out:
-        out: wp.array3d[int],
+        out: wp.array3d[wp.uint8],
     ):
-        """Finds smoke in squares of 8 x 8 voxels along y and z. Bits 0 to 2 say whether any voxel, one of the first and
-        one of the last along z have some; bits 3 to 5 the same of the first voxels along y, 6 to 8 of the last."""
+        """Says which runs of 8 voxels along y and z, with a voxel on either side, hold any smoke."""
         i, b, c = wp.tid()
-        found = int(0)
-        for n in range(BRICK):
-            j = b * BRICK + n
-            if j < smoke.cells[1]:
+        some = bool(False)
+        for n in range(BRICK + 2):
+            j = b * BRICK + n - 1
+            if j >= 0 and j < smoke.cells[1]:
                 at = _start(smoke.places, i, j, c)
-                row = found_in(smoke.density, at[0], at[1], at[2], wp.min(smoke.cells[2] - c * BRICK, BRICK))
-                found = found | row
-                if n == 0:
-                    found = found | row << 3
-                if n == BRICK - 1:
-                    found = found | row << 6
-        out[i, b, c] = found
+                some = holds_any(smoke.density, at[0], at[1], at[2], wp.min(smoke.cells[2] - c * BRICK, BRICK)) or some
+                for side in range(2):
+                    k = wp.where(side == 0, c * BRICK - 1, (c + 1) * BRICK)
+                    if k >= 0 and k < smoke.cells[2]:
+                        some = _voxel(smoke.density, smoke.places, i, j, k) > 0.0 or some
+        out[i, b, c] = wp.uint8(some)
 
     return kernel
 
 
 @wp.kernel(module="unique", module_options=OPTIONS)
-def _bricks_of_squares(
+def _bricks_of_runs(
     # in:
-    squares: wp.array3d[int],
+    runs: wp.array3d[wp.uint8],
     # out:
     bricks: wp.array3d[wp.uint8],
 ):
     a, b, c = wp.tid()
-    smoke = int(0)
+    smoke = wp.uint8(0)
     # A sample in a brick reads up to half a voxel beyond the brick.
-    for i in range(wp.max(a * BRICK - 1, 0), wp.min((a + 1) * BRICK + 1, squares.shape[0])):
-        for y in range(-1, 2):
-            for z in range(-1, 2):
-                if b + y >= 0 and b + y < squares.shape[1] and c + z >= 0 and c + z < squares.shape[2]:
-                    # The last voxels of the square before, and the first ones of the square after.
-                    bit = 3 * ((y + 3) % 3) + (z + 3) % 3
-                    smoke = smoke | squares[i, b + y, c + z] >> bit
-    bricks[a, b, c] = wp.uint8(smoke & 1)
+    for n in range(BRICK + 2):
+        i = a * BRICK + n - 1
+        if i >= 0 and i < runs.shape[0]:
+            smoke = wp.max(smoke, runs[i, b, c])
+    bricks[a, b, c] = smoke
 
 
 def occupied(medium: Medium) -> wp.array:
@@ -684,9 +611,9 @@ def occupied(medium: Medium) -> wp.array:
         uint8 [X / 8, Y / 8, Z / 8], rounded up: 1 where the brick, or a voxel next to it, has smoke; else 0.
     """
     shape = tuple(-(-n // BRICK) for n in medium.shape)
-    squares, bricks = medium.buffer((medium.shape[0], *shape[1:]), int), medium.buffer(shape, wp.uint8)
-    _squares(medium, squares.shape, [], [squares])
-    wp.launch(_bricks_of_squares, shape, [squares], [bricks], device=medium.device)
+    runs, bricks = (medium.buffer((n, *shape[1:]), wp.uint8) for n in (medium.shape[0], shape[0]))
+    _runs(medium, runs.shape, [], [runs])
+    wp.launch(_bricks_of_runs, shape, [runs], [bricks], device=medium.device)
     return bricks
 
 

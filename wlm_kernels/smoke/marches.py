@@ -65,7 +65,7 @@ def _guide(smoke_type: Any, from_lattice: bool) -> wp.Kernel:
     def kernel(
         # in:
         smoke: smoke_type,
-        nodes: wp.array3d[wp.vec2h],
+        nodes: wp.array3d[wp.vec2],
         view: View,
         lattice: Lattice,
         march: MarchParameters,
@@ -124,24 +124,18 @@ def guide(medium: Medium, view: View, march: March, out: wp.array, *, shared: bo
             at least a voxel apart; otherwise each sample marches to the lights itself, which is slower and more exact.
     """
     medium = _in_bricks(medium, march)
-    lattice, nodes = Lattice(), medium.buffer((0, 0, 0), wp.vec2h)
+    lattice, nodes = Lattice(), medium.buffer((0, 0, 0), wp.vec2)
     if shared:
         lattice, nodes = reach(medium, view.up, None, replace(march, spacing=max(march.step, 1.0)))
     _guide(medium, in_tiles(*out.shape[1:]), [nodes, view, lattice, parameters(march)], [out], shared)
 
 
 @wp.func
-def _depths(nodes: wp.array4d[wp.vec2h], pair: int, i: int, j: int, k: int) -> wp.vec2:
-    both = nodes[pair, i, j, k]
-    return wp.vec2(float(both[0]), float(both[1]))
-
-
-@wp.func
-def _in_plane(nodes: wp.array4d[wp.vec2h], i: int, j: int, k: int, fx: float, fy: float) -> wp.vec4:
+def _in_plane(nodes: wp.array4d[wp.vec2], i: int, j: int, k: int, fx: float, fy: float) -> wp.vec4:
     sides = wp.vec4()
     for pair in range(2):
-        a = wp.lerp(_depths(nodes, pair, i, j, k), _depths(nodes, pair, i, j + 1, k), fy)
-        b = wp.lerp(_depths(nodes, pair, i + 1, j, k), _depths(nodes, pair, i + 1, j + 1, k), fy)
+        a = wp.lerp(nodes[pair, i, j, k], nodes[pair, i, j + 1, k], fy)
+        b = wp.lerp(nodes[pair, i + 1, j, k], nodes[pair, i + 1, j + 1, k], fy)
         c = wp.lerp(a, b, fx)
         sides[2 * pair] = c[0]
         sides[2 * pair + 1] = c[1]
@@ -154,7 +148,7 @@ def _coarse(smoke_type: Any, hot: bool) -> wp.Kernel:
     def kernel(
         # in:
         smoke: smoke_type,
-        nodes: wp.array4d[wp.vec2h],
+        nodes: wp.array4d[wp.vec2],
         view: View,
         lattice: Lattice,
         march: MarchParameters,
@@ -243,7 +237,7 @@ def _light(smoke_type: Any) -> wp.Kernel:
     def kernel(
         # in:
         smoke: smoke_type,
-        nodes: wp.array3d[wp.vec2h],
+        nodes: wp.array3d[wp.vec2],
         view: View,
         lattice: Lattice,
         march: MarchParameters,
