@@ -14,7 +14,6 @@ from benchmarks.smoke_tracing import trace
 from demos.plume import make_plume
 from wlm.fluid.volume import from_array, gather
 from wlm.smoke.camera import Camera
-from wlm.smoke.march.launch import in_bricks
 from wlm.smoke.march.motion import motion
 from wlm.smoke.march.six_way import bake, bake_coarse, guide
 from wlm.smoke.shading import Light, PointLight, sky_lights
@@ -68,7 +67,6 @@ def test_smoke_in_bricks_is_lit_as_in_all_voxels(device: str, half: bool):
     where = {"places": places.view(3, 3, 3), "cells": dense.shape}
     bricks = replace(dense, density=density, temperature=temperature, **where)
     assert 1 < len(density) < 27 and bricks.shape == dense.shape and bricks.thickness == pytest.approx(dense.thickness)
-    assert torch.equal(in_bricks(bricks).near, in_bricks(dense).near) and not in_bricks(dense).near.all()
     camera = facing(dense, (0.4, 0.3, 1.0), 16)
     lights = [Light((1.0, 0.5, 0.2)), PointLight((-0.5, 0.9, 0.3), (1.0, 2.0, 3.0))]
     velocity = wp.array(np.full((5, 6, 5, 3), 0.1), dtype=wp.vec3, device=device)

@@ -90,11 +90,8 @@ class DensityVolume:
         kelvin: Whether the file has kelvins; the temperature is then the light of black bodies, 1 at 1,500 kelvin.
         warnings: The values that were repaired, one line for each kind.
         places: int32 tensor [X / 8, Y / 8, Z / 8], rounded up, numbers of bricks of 8^3 voxels: density and temperature
-            are then [N, 8, 8, 8], with 0 in brick 0 and anything in bricks that have no place. None: all voxels are
-            stored.
+            are then [N, 8, 8, 8], with 0 in brick 0. None: all voxels are stored.
         cells: X, Y and Z of a volume with `places`.
-        near: uint8 tensor like `places`, 1 where a brick, or a voxel next to it, has smoke, else 0. None: each march
-            finds these bricks, see `wlm.smoke.march.launch.in_bricks`.
         solid: Obstacles for marches that light the smoke, see `wlm.view.smoke.Drawing.among`.
     """
 
@@ -108,7 +105,6 @@ class DensityVolume:
     warnings: tuple[str, ...] = ()
     places: torch.Tensor | None = None
     cells: tuple[int, int, int] | None = None
-    near: torch.Tensor | None = None
     solid: "Solid | None" = None
 
     @property

@@ -318,10 +318,8 @@ def _frame_steps(scene: Scene, solver: fluid.Solver, frame: int) -> Iterator[boo
         # The state is of a scene with other steps.
         solver.change_step(count / longest)
         count = longest
-    # Sources at rest are the same at every step.
+    # Other sources are those of `make_solver` at every step.
     changes = any(body.eased.moves or body.noise or body.spans != [(0.0, None)] for body in scene.sources)
-    if not changes:
-        solver.sources = tuple(sources_at(scene, (frame - 1) / scene.rate))
     while step < count:
         while step % every == 0 and (speed := solver.fastest) > _FAST:
             if 2 * count * solver.substeps > MOST_STEPS:

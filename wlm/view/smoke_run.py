@@ -11,7 +11,6 @@ from wlm.fluid.volume import DensityVolume
 from wlm.interop import StepGraph
 from wlm.smoke.camera import Camera
 from wlm.smoke.lightmaps import SixWay
-from wlm.smoke.march.launch import in_bricks
 from wlm.smoke.march.six_way import guide
 from wlm.smoke.network.prediction import SmokePredictor, predict
 from wlm.smoke.scene import Scene, make_camera
@@ -93,12 +92,9 @@ def run(
 
     def light() -> None:
         nonlocal made
-        volume = in_bricks(volume_of(scene, solver))
+        volume = volume_of(scene, solver)
         # Obstacles shadow the surface of lightmaps when these are drawn.
         made = lighting(volume if lighting.albedo is None else drawing.among(volume), camera, lights)
-
-    def draw() -> None:
-        drawing(made)
 
     graphs: dict[tuple, list[Callable[[], None]]] = {}
     smoke = False
@@ -113,9 +109,8 @@ def run(
         frame = solver.frame()
         place = (frame.density.data_ptr(), frame.density.shape)
         if place not in graphs:
-            if len(graphs) == solver.period:
-                graphs.clear()
-            graphs[place] = [each if lighting.network else StepGraph(each, device, 1) for each in (light, draw)]
+            steps = light, lambda: drawing(made)
+            graphs[place] = [step if lighting.network else StepGraph(step, device, 1) for step in steps]
         for stage, step in zip((lighting.stage, DRAWING), graphs[place], strict=True):
             step()
             clock.stop(stage)

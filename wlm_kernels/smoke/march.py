@@ -34,12 +34,9 @@ BRICK = 8
 OPTIONS = {"enable_backward": False}
 """Options of every module of smoke kernels."""
 
-_AHEAD = wp.constant(4)  # steps of a ray that a GPU samples at a time
 _NEVER = wp.constant(1.0e30)
 _SEEDS = 2**32
 _PATTERNS = wp.constant(64)  # number of patterns of the gradient noise, a power of 2
-
-_Several = wp.types.vector(length=int(_AHEAD), dtype=float)
 
 
 @wp.struct
@@ -52,26 +49,6 @@ class Solid:
     corner: wp.vec3
     voxel: float
     stop: wp.array2d[float]
-
-
-_ANY = """
-    const auto* voxels = &wp::index(field, i, j, k);
-#if defined(__CUDA_ARCH__)
-    // A warp reads memory fastest by 16 bytes a thread.
-    if (count == 8 && field.strides[2] == sizeof(*voxels) && reinterpret_cast<size_t>(voxels) % 16 == 0) {
-        unsigned any = 0;
-        for (int n = 0; n < sizeof(*voxels) / 2; ++n) {
-            const uint4 part = __ldg(reinterpret_cast<const uint4*>(voxels) + n);
-            any |= part.x | part.y | part.z | part.w;
-        }
-        return any != 0;
-    }
-#endif
-    for (int n = 0; n < count; ++n)
-        if (static_cast<float>(wp::index(field, i, j, k + n)) > 0.0f)
-            return true;
-    return false;
-"""
 
 
 @functools.cache
@@ -103,9 +80,9 @@ class Medium:
 
     `empty` allocates buffers on the density's device; None: Warp's own allocator. `bricks` tells which bricks of 8^3
     voxels contain smoke, a result of `occupied`; None: marches sample every voxel. With `places`, int [X / 8, Y / 8,
-    Z / 8], the numbers of bricks in `density` and `temperature`, these are [8 N, 8, 8], with 0 in brick 0; None: all
-    voxels are stored. `cells` are X, Y and Z; None: the density's. `solid` are obstacles in the way of light and
-    camera; None: there are none.
+    Z / 8], the numbers of bricks in `density` and `temperature`, these are [8 N, 8, 8], with 0 in brick 0, and `bricks`
+    must be given; None: all voxels are stored. `cells` are X, Y and Z; None: the density's. `solid` are obstacles in
+    the way of light and camera; None: there are none.
     """
 
     density: wp.array
@@ -219,7 +196,7 @@ class Ray:
     `done` is the number of the current step, and `offset` the position of the sample in each step, 0 to 1. The sample
     of the current step is at `distance` along the ray, at the point `place`, and has the extinction `sigma` per voxel;
     `x` is the optical depth of the step. `tau` and `t` are the ray's optical depth and transparency before the step.
-    `ahead` has the densities of the steps that are sampled already.
+    `pair` has the densities of an even step and of the next one.
     """
 
     origin: wp.vec3
@@ -235,7 +212,7 @@ class Ray:
     x: float
     tau: float
     t: float
-    ahead: _Several
+    pair: wp.vec2
 
 
 @wp.func
@@ -451,36 +428,16 @@ def begin_jittered(view: View, row: int, column: int, smoke: Any, march: MarchPa
     return begin(view, row, column, smoke, march.step, offset)
 
 
-# A GPU's thread would wait for the memory in each step.
-@wp.func_native(f"""
-#if defined(__CUDA_ARCH__)
-return {int(_AHEAD)};
-#else
-return 1;
-#endif
-""")
-def _at_once() -> int: ...
-
-
 @wp.func
 def look(r: Ray, smoke: Any) -> Ray:
-    """Samples the smoke in the ray's current step: sets the step's `distance`, `place`, `sigma` and `x`. Steps must
-    follow one another from step 0."""
-    if r.done % _at_once() == 0:
-        some = bool(False)
-        for n in range(_AHEAD):
-            if n < _at_once():
-                some = _has_smoke(smoke.bricks, point_on(r, r.done + n, r.offset)) or some
-        r.ahead = _Several()
-        if some:
-            for n in range(_AHEAD):
-                if n < _at_once():
-                    r.ahead[n] = density_at(smoke.density, smoke, point_on(r, r.done + n, r.offset))
+    """Samples the smoke in the ray's current step: sets the step's `distance`, `place`, `sigma` and `x`. Steps follow
+    one another from step 0."""
     r.distance = r.first + (float(r.done) + r.offset) * r.length
     r.place = r.origin + r.distance * r.direction
-    r.sigma = smoke.extinction * r.ahead[0]
-    for n in range(_AHEAD - 1):
-        r.ahead[n] = r.ahead[n + 1]
+    if r.done % 2 == 0:
+        # Two samples at once, since a GPU's threads wait for them. One beyond the ray's end is not used.
+        r.pair = wp.vec2(sample(smoke, r.place), sample(smoke, point_on(r, r.done + 1, r.offset)))
+    r.sigma = smoke.extinction * wp.where(r.done % 2 == 0, r.pair[0], r.pair[1])
     r.x = r.sigma * r.length
     return r
 
@@ -545,62 +502,40 @@ def nodes_along(shape: Sequence[int], step: float) -> tuple[int, ...]:
     return tuple(math.ceil((n + 1) / max(step, 1.0)) + 1 for n in shape)
 
 
-@wp.func
-def _start(places: int, i: int, j: int, c: int) -> wp.vec3i:
-    """Returns where the run number c of 8 voxels along z is stored."""
-    return wp.vec3i(i, j, BRICK * c)
-
-
-@wp.func
-def _start(places: wp.array3d[int], i: int, j: int, c: int) -> wp.vec3i:
-    return wp.vec3i(BRICK * places[i // BRICK, j // BRICK, c] + i % BRICK, j % BRICK, 0)
-
-
-@for_smoke
-def _runs(smoke_type: Any) -> wp.Kernel:
-    density = smoke_type.vars["density"].type
-
-    @wp.func_native(_ANY)
-    def holds_any(field: density, i: int, j: int, k: int, count: int) -> bool: ...
+@functools.cache
+def occupied_kernel(dtype: Any) -> wp.Kernel:
+    """Builds (once) the kernel that says which runs of 8 voxels along z, and a voxel on either side, hold any smoke."""
 
     @wp.kernel(module="unique", module_options=OPTIONS)
-    def kernel(
+    def rows(
         # in:
-        smoke: smoke_type,
+        density: wp.array3d[dtype],
         # out:
         out: wp.array3d[wp.uint8],
     ):
-        """Says which runs of 8 voxels along y and z, with a voxel on either side, hold any smoke."""
-        i, b, c = wp.tid()
-        some = bool(False)
-        for n in range(BRICK + 2):
-            j = b * BRICK + n - 1
-            if j >= 0 and j < smoke.cells[1]:
-                at = _start(smoke.places, i, j, c)
-                some = holds_any(smoke.density, at[0], at[1], at[2], wp.min(smoke.cells[2] - c * BRICK, BRICK)) or some
-                for side in range(2):
-                    k = wp.where(side == 0, c * BRICK - 1, (c + 1) * BRICK)
-                    if k >= 0 and k < smoke.cells[2]:
-                        some = _voxel(smoke.density, smoke.places, i, j, k) > 0.0 or some
-        out[i, b, c] = wp.uint8(some)
+        i, j, c = wp.tid()
+        smoke = wp.uint8(0)
+        for k in range(wp.max(c * BRICK - 1, 0), wp.min((c + 1) * BRICK + 1, density.shape[2])):
+            if float(density[i, j, k]) > 0.0:
+                smoke = wp.uint8(1)
+        out[i, j, c] = smoke
 
-    return kernel
+    return rows
 
 
 @wp.kernel(module="unique", module_options=OPTIONS)
-def _bricks_of_runs(
+def _bricks_of_rows(
     # in:
-    runs: wp.array3d[wp.uint8],
+    rows: wp.array3d[wp.uint8],
     # out:
     bricks: wp.array3d[wp.uint8],
 ):
     a, b, c = wp.tid()
     smoke = wp.uint8(0)
     # A sample in a brick reads up to half a voxel beyond the brick.
-    for n in range(BRICK + 2):
-        i = a * BRICK + n - 1
-        if i >= 0 and i < runs.shape[0]:
-            smoke = wp.max(smoke, runs[i, b, c])
+    for i in range(wp.max(a * BRICK - 1, 0), wp.min((a + 1) * BRICK + 1, rows.shape[0])):
+        for j in range(wp.max(b * BRICK - 1, 0), wp.min((b + 1) * BRICK + 1, rows.shape[1])):
+            smoke = wp.max(smoke, rows[i, j, c])
     bricks[a, b, c] = smoke
 
 
@@ -610,10 +545,12 @@ def occupied(medium: Medium) -> wp.array:
     Returns:
         uint8 [X / 8, Y / 8, Z / 8], rounded up: 1 where the brick, or a voxel next to it, has smoke; else 0.
     """
-    shape = tuple(-(-n // BRICK) for n in medium.shape)
-    runs, bricks = (medium.buffer((n, *shape[1:]), wp.uint8) for n in (medium.shape[0], shape[0]))
-    _runs(medium, runs.shape, [], [runs])
-    wp.launch(_bricks_of_runs, shape, [runs], [bricks], device=medium.device)
+    density = medium.density
+    shape = tuple(-(-n // BRICK) for n in density.shape)
+    # Rows are reduced first, so that neighbouring threads read neighbouring voxels, and each voxel once.
+    rows, bricks = medium.buffer((*density.shape[:2], shape[2]), wp.uint8), medium.buffer(shape, wp.uint8)
+    wp.launch(occupied_kernel(density.dtype), rows.shape, [density], [rows], device=density.device)
+    wp.launch(_bricks_of_rows, shape, [rows], [bricks], device=density.device)
     return bricks
 
 

@@ -17,7 +17,7 @@ from wlm.fluid.volume import DensityVolume
 from wlm.interop import device_name, stream
 from wlm.smoke.camera import DIRECTIONS, Camera
 from wlm.smoke.lightmaps import SixWay, StepError
-from wlm.smoke.march.launch import in_bricks, run
+from wlm.smoke.march.launch import run
 from wlm.smoke.scene import Looks
 from wlm_kernels.smoke import march_six, marches
 from wlm_kernels.smoke.settings import March
@@ -57,7 +57,6 @@ def bake(
     if supersample < 1:
         raise ValueError(f"supersample: expected at least 1 ray along a pixel's edge, got {supersample}")
     with stream(device_name(volume.device)):
-        volume = in_bricks(volume)
         fine = _planes(volume, camera, March(step=step, g=g), supersample)
         error = None
         if estimate:
@@ -85,7 +84,7 @@ def bake_coarse(volume: DensityVolume, camera: Camera, march: March = March()) -
         volume: The smoke.
         camera: Orthographic.
         march: Settings. Nodes of the lattice that stores optical depths to the lights are at least a quarter of a voxel
-            apart, and farther apart if there would be more than 2^28 nodes; a node takes 10 bytes. There are 64
+            apart, and farther apart if there would be more than 2^28 nodes; a node takes 32 bytes. There are 64
             different seeds of the jitter, which is gradient noise.
 
     Returns:
