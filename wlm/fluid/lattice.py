@@ -157,8 +157,7 @@ class Lattice:
         # The settings for which the kernel of a step is specialised.
         self._spec = replace(spec, wide=math.prod(size) > NARROW)
         self._arrays = [self._zeros(size, STORAGES[storage][0]) for _ in range(1 if save_memory else 2)]
-        # The populations' parity if steps work in place, else the array that has them; and that of the clock.
-        self._parity = 0
+        self._parity = 0  # of the clock and, in place, of the populations; else the array that has them
         # A ramp of one step is no ramp: inflow begins after it.
         self._tau, self._eddy, self._rise = 0.5 + 3.0 * viscosity, eddy_factor(smagorinsky), 1.0 / max(ramp, 1)
         # The counter of steps and the first error, see `wlm_kernels.fluid.lattice.step_kernel`.
@@ -299,8 +298,7 @@ class Lattice:
         else:
             where = [self._tables, self._layout]
             means = self._zeros((4, self._cells), self._f.dtype) if self._spec.in_place else self._spare
-            inputs = [*where, self._f, self._solid, new]
-            self._launch(self._fluid_kernels.neighbours, self._cells, inputs, [means])
+            self._launch(self._fluid_kernels.neighbours, self._cells, [*where, self._f, self._solid, new], [means])
             self._launch(self._fluid_kernels.uncover, self._cells, [*where, self._solid, new, means], [self._f])
         self._spec = replace(self._spec, solids=True)
         wp.copy(self._solid, new)
@@ -480,8 +478,7 @@ class Lattice:
         return total.numpy()[body]
 
     def state(self) -> dict[str, np.ndarray]:
-        """Returns the state, for `load`: populations that have left the cells, solid cells and their motion, number of
-        steps done."""
+        """Returns the state, for `load`: populations that have left cells, solids and their motion, number of steps."""
         self._prepare()
         # On a CPU .numpy() shares the array's memory, which the next step modifies.
         return {

@@ -155,8 +155,7 @@ def _relax(spec: Spec) -> Any:
 
 @functools.cache
 def step_kernel(spec: Spec) -> wp.Kernel:
-    """Builds (once) the kernel that does a step with the settings of a spec, one thread per cell of a
-    slab.
+    """Builds (once) the kernel that does a step with the settings of a spec, one thread per cell of a slab.
 
     Args of the kernel, for N cells and Q velocities:
         first: Index of the slab's first cell.
@@ -172,8 +171,7 @@ def step_kernel(spec: Spec) -> wp.Kernel:
         sums: float64 [2 P], set to 0, for `lattice_links.apply`.
         out: [Q, N], the populations that leave every cell in this step: in place `f`, else another array.
     """
-    memory = memory_functions(spec.lattice, spec.storage, spec.walls, spec.wide, spec.in_place)
-    relax = _relax(spec)
+    memory, relax = memory_functions(spec.lattice, spec.storage, spec.walls, spec.wide, spec.in_place), _relax(spec)
     gather, moments, scatter, stored = memory.gather, memory.moments, memory.scatter, STORAGES[spec.storage][0]
 
     @wp.kernel(module="unique", module_options=_OPTIONS)

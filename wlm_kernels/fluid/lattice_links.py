@@ -111,8 +111,7 @@ def mirrored(t: Tables, n: wp.vec3i, bounded: wp.vec3i, i: int, q: int):
 def link_kernels(
     lattice_name: str, storage: str, balance: bool, wide: bool = True, in_place: bool = False
 ) -> LinkKernels:
-    """Builds (once) the kernels that set populations at boundaries and sum forces; `balance`: outlets conserve mass;
-    for the others see `memory_functions`."""
+    """Builds (once) the kernels of boundaries and forces; `balance`: outlets conserve mass; see `memory_functions`."""
     memory = memory_functions(lattice_name, storage, (True, True, True), wide, in_place)
     departed, load, store, moments = memory.departed, memory.load, memory.store, memory.moments
     element, arriving, leaving = memory.element, memory.arriving, memory.leaving

@@ -202,15 +202,13 @@ class MemoryFunctions:
 
     The elements from which a cell reads what arrives are thus, with the other parity, those of what leaves the same
     cell in the opposite directions. So a step writes where it has read, and needs one array (the AA pattern: Bailey et
-    al., "Accelerating lattice Boltzmann fluid flow simulations using graphics processors", 2009). With two arrays, a
-    step reads one of parity 0 and writes the other, also of parity 0, which is faster.
+    al., "Accelerating lattice Boltzmann fluid flow simulations using graphics processors", 2009). Two are faster.
 
     Attributes:
         vec: vec of Q floats.
         gather: (f, n, walled, i, parity) -> scaled vec, the populations that arrive at cell i.
         departed: (f, n, walled, i, parity) -> scaled vec, the populations that have left cell i.
-        scatter: (f, n, walled, i, parity, scaled vec), writes the populations that leave cell i; the parity is that of
-            f after.
+        scatter: (f, n, walled, i, parity of f after it, scaled vec), writes the populations that leave cell i.
         moments: scaled vec -> rho - 1, momentum, the diagonal and the off-diagonal (xy, xz, yz) of sum_q c c (f - w).
         element: (f, q, i) -> element (q, i).
         arriving: (f, layout, i, p, q, c_q) -> element of the population q that arrives at cell i, which is at p.
