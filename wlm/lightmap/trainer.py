@@ -5,6 +5,8 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
@@ -27,7 +29,8 @@ _STATE = ("maps", "hidden", "output", "loss", "control")
 
 _MOMENTUM = 0.9  # Adam's decay of gradients
 _ADAM_EPSILON = 1e-8  # the loss is a mean over the samples and channels of a tile
-_CHUNK = {"cpu": 5, "cuda": 50}  # steps between two looks at the clock
+_CHUNK = {"cpu": 5, "cuda": 200}  # steps between two looks at the clock
+_REPEATS = 50  # steps in one CUDA graph, so that the GPU does not wait for the host between them
 
 
 class Targets:
@@ -169,13 +172,9 @@ class Trainer:
         with interop.stream(device):
             self._allocate(shapes, profile.hidden)
             self._upload(targets, seed, profile.gamma, slices)
-            self._schedule = self._rates_over_steps(profile.final_rate)
+            self.batch.schedule = self._rates_over_steps(profile.final_rate)
             self._draw(seed)
-        self._stages = [
-            interop.StepGraph(lambda: self._step(False, True), device, warmup=2),
-            interop.StepGraph(lambda: self._step(True, True), device, warmup=1),
-            interop.StepGraph(lambda: self._step(True, False), device, warmup=1),
-        ]
+        self._repeated = [interop.LaunchGraph(partial(self._repeat, stage), device, warmup=1) for stage in range(3)]
 
     def _allocate(self, shapes: dict[str, tuple[int, ...]], hidden: int) -> None:
         """Allocates maps of these shapes, networks of a hidden width, and all arrays that a training step writes."""
@@ -200,10 +199,12 @@ class Trainer:
             setattr(maps, key, interop.to_warp(view, types.get(key, wp.float32)))
         self._maps = maps
         # The maps on the levels of the file, which a step reads once they are quantised.
-        self._rounded = features.Maps()
+        self._rounded, rounded = features.Maps(), zeros(self._offsets.ut)
         self._rounded.ut, self._rounded.vt = maps.ut, maps.vt
         for key in ("uv_endpoints", "uv_weights", "uvt_endpoints", "uvt_weights"):
-            setattr(self._rounded, key, wp.empty_like(getattr(maps, key)))
+            at, shape = getattr(self._offsets, key), shapes[key]
+            own = rounded[at : at + lengths[key]].view(shape)
+            setattr(self._rounded, key, interop.to_warp(own, types.get(key, wp.float32)))
 
         self._lanes = lanes = 1 if self._cuda else CPU_LANES
         parts = self._samples // lightmap_step.BLOCK if self._cuda else lanes
@@ -236,20 +237,25 @@ class Trainer:
             wrap(self._partial_out.view(parts, -1)),
             wrap(self._loss_parts),
         )
-        # The last arguments of `update_maps` and `update_net`.
-        self._maps_update = wrap(self._acc), adams[0], wrap(self.maps), wrap(self._rates)
-        flat = (wrap(values.view(-1)) for values in nets)
-        self._net_update = *net_sums, wrap(self._rates), *adams[1:], *flat, wrap(self.loss), wrap(self.control)
+        fours = wrap(self._acc.view(lanes, -1, 4), gather.vec4l if self._cuda else wp.vec4)
+        # The arguments of `gather.update`.
+        arguments: list = [wrap(self._rates), self._offsets, fours, adams[0], wrap(self.maps.view(-1, 4), wp.vec4)]
+        for sums, moments, values in zip(net_sums, adams[1:], nets, strict=False):
+            arguments += [sums, moments, wrap(values.view(-1))]
+        arguments += [net_sums[2], wrap(self.loss), wrap(self.control), wrap(rounded.view(-1, 4), wp.vec4)]
+        self._update_args = arguments
 
-    def _moments_of(self, name: str, values: torch.Tensor) -> gather.Adam:
+    def _moments_of(self, name: str, values: torch.Tensor) -> Any:
         """Returns the state of the optimiser (Adam) for one array of parameters, with all moments 0."""
-        adam = gather.Adam()
+        fours = name == "maps"
+        adam = gather.AdamOfFours() if fours else gather.Adam()
         adam.decay = wp.vec2(_MOMENTUM, self._decay)
         adam.epsilon = _ADAM_EPSILON
         for key, field in (("exp_avg", "first"), ("exp_avg_sq", "second")):
             moments = torch.zeros(values.numel(), device=self.device)
             self._moments[f"adam_{name}.{key}"] = moments
-            setattr(adam, field, interop.to_warp(moments))
+            wrapped = interop.to_warp(moments.view(-1, 4), wp.vec4) if fours else interop.to_warp(moments)
+            setattr(adam, field, wrapped)
         return adam
 
     def _upload(self, targets: Targets, seed: int, gamma: float, slices: int) -> None:
@@ -279,7 +285,8 @@ class Trainer:
         batch.seed = seed
         batch.emphasis = targets.emphasis
         batch.periodic = int(self.axis.periodic)
-        batch.quantised = 0
+        batch.quantised = batch.frozen = 0
+        batch.first_rates, batch.rates = wp.vec2(*self._first_rates), interop.to_warp(self._rates)
         self.batch = batch
 
     def _rates_over_steps(self, final_rate: float) -> wp.array:
@@ -320,43 +327,55 @@ class Trainer:
 
     def run(self, steps: int) -> None:
         """Runs the given number of training steps; on a GPU it only queues them."""
-        first = self.step
-        threads = torch.get_num_threads()
+        step, threads = self.step, torch.get_num_threads()
+        end = step + steps
         try:
             if not self._cuda:
                 # A second thread of torch would spin between its calls, on the core that a lane needs.
                 torch.set_num_threads(1)
             with interop.stream(self.device):
-                for step in range(first, first + steps):
-                    self._stages[self.stage(step)]()
+                # Steps keep the maps' levels up to date from here on.
+                self._round()
+                while step < end:
+                    stage, last = self.stage(step), step + _REPEATS
+                    if step == self._quantised_from:
+                        self._round()
+                    if self._cuda and last <= end and self.stage(last - 1) == stage:
+                        self._repeated[stage]()
+                        step = last
+                    else:
+                        self._step(stage)
+                        step += 1
         finally:
             torch.set_num_threads(threads)
 
-    def _step(self, quantised: bool, move_maps: bool) -> None:
-        self._add_gradients(quantised)
-        self._update(move_maps)
+    def _repeat(self, stage: int) -> None:
+        for _ in range(_REPEATS):
+            self._step(stage)
 
-    def _add_gradients(self, quantised: bool) -> None:
-        maps = self._maps
-        self.batch.quantised = 0
-        if quantised:
-            self.batch.quantised, maps = 2, self._rounded
-            for pair in (("uv_endpoints", "uv_weights"), ("uvt_endpoints", "uvt_weights")):
-                blocks.round_to_levels(*(getattr(each, name) for each in (self._maps, maps) for name in pair))
+    def _step(self, stage: int) -> None:
+        self._add_gradients(stage)
+        self._update(stage)
+
+    def _round(self) -> None:
+        """Puts endpoints and weights on the levels of the file, for steps of quantised maps."""
+        for pair in (("uv_endpoints", "uv_weights"), ("uvt_endpoints", "uvt_weights")):
+            blocks.round_to_levels(*(getattr(each, name) for each in (self._maps, self._rounded) for name in pair))
+
+    def _add_gradients(self, stage: int) -> None:
+        quantised = stage > 0
+        self.batch.quantised, self.batch.frozen = 2 * quantised, int(stage == 2)
         on_levels = quantised and self._integers
         if on_levels:
             levels.put_on_levels(*self._levels_args)
-        hidden, output = self._nets[on_levels]
-        args = (maps, self._offsets, hidden, output, self.batch, self._samples, *self._launch_sums)
+        maps, nets = self._rounded if quantised else self._maps, self._nets[on_levels]
+        args = (maps, self._offsets, *nets, self.batch, self._samples, *self._launch_sums)
         span = self._samples // self._lanes
         self._share(lambda lane: self._kernels.launch(*args, lane * span, span))
 
-    def _update(self, move_maps: bool) -> None:
-        args = (self._schedule, self._first_rates, self.batch.control, move_maps, *self._maps_update)
-        total = self.maps.numel()
-        span = -(-total // self._lanes)
-        self._share(lambda lane: gather.update_maps(*args, lane * span, min(span, total - lane * span)))
-        gather.update_net(*self._net_update)
+    def _update(self, stage: int) -> None:
+        options = {"frozen": stage == 2, "levels": stage == 1, "lanes": self._lanes}
+        self._share(lambda lane: gather.update(*self._update_args, **options, lane=lane))
 
     def _share(self, work: Callable[[int], None]) -> None:
         """Runs `work(i)` for each lane i, each in its own thread; kernel launches release Python's lock."""
@@ -481,12 +500,12 @@ class Fitter:
         chunk, frozen, steps = _CHUNK["cpu" if self._device == "cpu" else "cuda"], trainer.frozen, trainer.steps
         step, end = trainer.step, time.monotonic() + seconds
         while step < steps:
-            count = min(chunk, steps - step)
+            count = min(chunk, (frozen if step < frozen else steps) - step)
             trainer.run(count)
             step += count
             if time.monotonic() >= end:
                 break
-            if self._track and step - count < frozen <= step < steps:
+            if self._track and step == frozen < steps:
                 trainer.psnr()  # samples before the maps were frozen do not count
         figures = {"loss": float(trainer.losses().mean()), "PSNR_dB": trainer.psnr()} if self._track else {}
         if step < steps:

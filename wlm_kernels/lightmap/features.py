@@ -127,11 +127,25 @@ class Batch:
     emphasis: float  # exponent of the colour over scale in the weight of a texel; 0: none
     periodic: int
     quantised: int  # as in `wlm_kernels.lightmap.blocks`
+    frozen: int  # whether the maps get no gradients
+    first_rates: wp.vec2  # the initial learning rates of the maps and of the networks
+    schedule: wp.array1d[wp.vec3]  # [steps] factor on the learning rates, and Adam's two corrections, see `gather`
+    rates: wp.array1d[float]  # [4] the rates of maps and networks at this step and the corrections, written
 
 
 @wp.func
 def draw_state(batch: Batch, n: int, b: int, samples: int) -> wp.uint32:
     return wp.rand_init(batch.seed + batch.number[n] * 9973, batch.control[0] * samples + b)
+
+
+@wp.func
+def write_rates(batch: Batch):
+    """Writes the rates of this step: the launch that uses them also counts the step and can't read its number."""
+    now = batch.schedule[wp.min(batch.control[0], batch.schedule.shape[0] - 1)]
+    batch.rates[0] = now[0] * batch.first_rates[0]
+    batch.rates[1] = now[0] * batch.first_rates[1]
+    batch.rates[2] = now[1]
+    batch.rates[3] = now[2]
 
 
 @wp.struct

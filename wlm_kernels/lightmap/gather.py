@@ -1,4 +1,4 @@
-"""Ends a training step: converts the sums of `step` to gradients, and updates the parameters with Adam in one pass.
+"""Ends a training step: converts the sums of `step` to gradients, and updates all parameters with Adam in one launch.
 
 Read `tests/kernels/test_optimiser.py` first; it compares the updates with those of torch's Adam.
 """
@@ -7,7 +7,13 @@ from typing import Any
 
 import warp as wp
 
+from wlm_kernels.lightmap.blocks import ste_endpoint, ste_weight
+from wlm_kernels.lightmap.features import Offsets
+
 wp.set_module_options({"enable_backward": False})
+
+vec4l = wp.types.vector(4, wp.int64)
+"""Four sums of a GPU, in steps of 2^-40, as `adjoint` adds them."""
 
 
 @wp.func
@@ -16,16 +22,26 @@ def _drain(sums: wp.array2d[float], i: int, clear: int) -> float:
     s = float(0.0)
     for p in range(sums.shape[0]):
         s += sums[p, i]
-        if clear != 0:
+    if clear != 0:  # a loop of its own: reads do not wait for writes
+        for p in range(sums.shape[0]):
             sums[p, i] = 0.0
     return s
 
 
 @wp.func
-def _drain(sums: wp.array2d[wp.int64], i: int, clear: int) -> float:
-    s = float(sums[0, i]) * 9.094947017729282e-13  # steps of 2^-40, as `adjoint` adds them
-    sums[0, i] = wp.int64(0)
+def _drain_four(sums: wp.array2d[wp.vec4], i: int) -> wp.vec4:
+    s = wp.vec4()
+    for p in range(sums.shape[0]):
+        s += sums[p, i]
+        sums[p, i] = wp.vec4()
     return s
+
+
+@wp.func
+def _drain_four(sums: wp.array2d[vec4l], i: int) -> wp.vec4:
+    s = sums[0, i]
+    sums[0, i] = vec4l()
+    return wp.vec4(float(s[0]), float(s[1]), float(s[2]), float(s[3])) * 9.094947017729282e-13
 
 
 @wp.struct
@@ -38,49 +54,40 @@ class Adam:
     second: wp.array1d[float]
 
 
+@wp.struct
+class AdamOfFours:
+    """`Adam` of an array whose parameters are updated four at a time."""
+
+    decay: wp.vec2
+    epsilon: float
+    first: wp.array1d[wp.vec4]
+    second: wp.array1d[wp.vec4]
+
+
 @wp.func
-def moved(adam: Adam, i: int, value: float, grad: float, rate: float, corrections: wp.vec2) -> float:
-    """Returns parameter i, now `value`, after Adam's step t, and updates its moments. `corrections` are
-    1 / (1 - decay[0]^t) and 1 / sqrt(1 - decay[1]^t), since the moments began at 0."""
-    first = adam.decay[0] * adam.first[i] + (1.0 - adam.decay[0]) * grad
-    second = adam.decay[1] * adam.second[i] + (1.0 - adam.decay[1]) * grad * grad
-    adam.first[i] = first
-    adam.second[i] = second
-    return value - rate * corrections[0] * first / (wp.sqrt(second) * corrections[1] + adam.epsilon)
+def _moved(
+    value: float,
+    grad: float,
+    first: float,
+    second: float,
+    decay: wp.vec2,
+    epsilon: float,
+    rate: float,
+    corrections: wp.vec2,
+) -> wp.vec3:
+    """Returns a parameter after Adam's step t and its two moments. `corrections` are 1 / (1 - decay[0]^t) and
+    1 / sqrt(1 - decay[1]^t), since the moments began at 0."""
+    m = decay[0] * first + (1.0 - decay[0]) * grad
+    v = decay[1] * second + (1.0 - decay[1]) * grad * grad
+    return wp.vec3(value - rate * corrections[0] * m / (wp.sqrt(v) * corrections[1] + epsilon), m, v)
 
 
-@wp.kernel
-def _update_maps(
-    # in:
-    schedule: wp.array1d[wp.vec3],
-    first_rates: wp.vec2,
-    control: wp.array1d[int],
-    move: int,
-    base: int,
-    # in and out:
-    acc: wp.array2d[Any],
-    adam: Adam,
-    parameters: wp.array1d[float],
-    # out:
-    rates: wp.array1d[float],
-):
-    i = base + wp.tid()
-    now = schedule[wp.min(control[0], schedule.shape[0] - 1)]
-    g = _drain(acc, i, 1)
-    value = wp.clamp(parameters[i], 0.0, 1.0)
-    if move != 0:
-        value = moved(adam, i, value, g, now[0] * first_rates[0], wp.vec2(now[1], now[2]))
-    parameters[i] = value
-    if i == 0:
-        rates[0] = now[0] * first_rates[0]
-        rates[1] = now[0] * first_rates[1]
-        rates[2] = now[1]
-        rates[3] = now[2]
-
-
-# Both forms are compiled with the module: the threads of a fit on the CPU would compile one at the same time.
-for _scalar in (float, wp.int64):
-    wp.overload(_update_maps, {"acc": wp.array2d[_scalar]})
+@wp.func
+def _move(values: wp.array1d[float], adam: Adam, i: int, grad: float, rate: float, corrections: wp.vec2):
+    new = _moved(values[i], grad, adam.first[i], adam.second[i], adam.decay, adam.epsilon, rate, corrections)
+    values[i] = new[0]
+    adam.first[i] = new[1]
+    adam.second[i] = new[2]
 
 
 @wp.func
@@ -90,95 +97,124 @@ def toward(mean: float, value: float) -> float:
 
 
 @wp.kernel
-def _update_net(
+def _update(
     # in:
     rates: wp.array1d[float],
+    offsets: Offsets,
+    levels: int,
+    base: int,
     clear: int,
     # in and out:
+    acc: wp.array2d[Any],
+    adam: AdamOfFours,
+    maps: wp.array1d[wp.vec4],
     partial: wp.array2d[float],
-    partial_out: wp.array2d[float],
-    loss: wp.array2d[float],
-    adam: Adam,
-    adam_out: Adam,
+    adam_hidden: Adam,
     hidden: wp.array1d[float],
+    partial_out: wp.array2d[float],
+    adam_out: Adam,
     output: wp.array1d[float],
+    loss: wp.array2d[float],
     mean_loss: wp.array1d[float],
     control: wp.array1d[int],
+    # out:
+    rounded: wp.array1d[wp.vec4],
 ):
-    i = wp.tid()
+    # Networks come first: their sums take longest.
+    t = base + wp.tid()
     corrections = wp.vec2(rates[2], rates[3])
-    if i < hidden.shape[0]:
-        hidden[i] = moved(adam, i, hidden[i], _drain(partial, i, clear), rates[1], corrections)
-    if i < output.shape[0]:
-        output[i] = moved(adam_out, i, output[i], _drain(partial_out, i, clear), rates[1], corrections)
-    if i < mean_loss.shape[0]:
-        mean_loss[i] = toward(mean_loss[i], _drain(loss, i, clear))
-    if i == 0:
+    if t == 0:
         control[0] = control[0] + 1
+    if t < hidden.shape[0]:
+        _move(hidden, adam_hidden, t, _drain(partial, t, clear), rates[1], corrections)
+        return
+    t -= hidden.shape[0]
+    if t < output.shape[0]:
+        _move(output, adam_out, t, _drain(partial_out, t, clear), rates[1], corrections)
+        return
+    t -= output.shape[0]
+    if t < mean_loss.shape[0]:
+        mean_loss[t] = toward(mean_loss[t], _drain(loss, t, clear))
+        return
+    t -= mean_loss.shape[0]
+    # All reads come before the first write, for which they would wait.
+    value = maps[t]
+    first = adam.first[t]
+    second = adam.second[t]
+    grad = _drain_four(acc, t)
+    for c in range(4):
+        v = wp.clamp(value[c], 0.0, 1.0)
+        new = _moved(v, grad[c], first[c], second[c], adam.decay, adam.epsilon, rates[0], corrections)
+        value[c] = new[0]
+        first[c] = new[1]
+        second[c] = new[2]
+    maps[t] = value
+    adam.first[t] = first
+    adam.second[t] = second
+    at = 4 * t
+    if levels != 0 and at < offsets.ut:
+        if at < offsets.uv_weights or (at >= offsets.uvt_endpoints and at < offsets.uvt_weights):
+            rounded[t] = ste_endpoint(value, 1)
+        else:
+            rounded[t] = wp.vec4(
+                ste_weight(value[0], 1), ste_weight(value[1], 1), ste_weight(value[2], 1), ste_weight(value[3], 1)
+            )
 
 
-def update_maps(
-    schedule: wp.array,
-    first_rates: tuple[float, float],
-    control: wp.array,
-    move: bool,
+# Both forms are compiled with the module: the threads of a fit on the CPU would compile one at the same time.
+for _four in (wp.vec4, vec4l):
+    wp.overload(_update, {"acc": wp.array2d[_four]})
+
+
+def update(
+    rates: wp.array,
+    offsets: Offsets,
     acc: wp.array,
-    adam: Adam,
-    parameters: wp.array,
-    rates: wp.array,
-    base: int = 0,
-    count: int | None = None,
-) -> None:
-    """Converts the maps' sums into gradients and updates the maps with Adam: the first half of a step's update.
-
-    Args:
-        schedule: vec3 [steps]: the factor on the initial learning rates, and Adam's two corrections, see `moved`.
-        first_rates: The initial learning rates of the maps and of the networks.
-        control: int [1], number of the step.
-        move: Whether Adam updates the maps; they are clamped in any case.
-        acc: The sums for the M parameters, as `StepKernels.launch` adds them; set to 0.
-        adam: State of the optimiser, updated.
-        parameters: float [M], the maps; clamped to [0, 1], then updated.
-        rates: float [4], written with parameter 0: the learning rates of maps and networks at this step, and Adam's
-            two corrections.
-        base, count: First index and number of the parameters that this launch updates; default all.
-    """
-    wp.launch(
-        _update_maps,
-        parameters.shape[0] - base if count is None else count,
-        inputs=[schedule, wp.vec2(*first_rates), control, int(move), base, acc, adam, parameters],
-        outputs=[rates],
-        device=parameters.device,
-    )
-
-
-def update_net(
+    adam: AdamOfFours,
+    maps: wp.array,
     partial: wp.array,
-    partial_out: wp.array,
-    loss: wp.array,
-    rates: wp.array,
-    adam: Adam,
-    adam_out: Adam,
+    adam_hidden: Adam,
     hidden: wp.array,
+    partial_out: wp.array,
+    adam_out: Adam,
     output: wp.array,
+    loss: wp.array,
     mean_loss: wp.array,
     control: wp.array,
+    rounded: wp.array,
+    *,
+    frozen: bool = False,
+    levels: bool = False,
+    lane: int = 0,
+    lanes: int = 1,
 ) -> None:
-    """Converts the networks' sums into gradients and updates the networks with Adam: ends a step's update.
+    """Converts sums into gradients, updates the parameters with Adam, and counts the step.
 
     Args:
+        rates: float [4]: the learning rates of maps and networks at this step and Adam's two corrections, see
+            `features.write_rates`.
+        offsets: Positions of the maps in `maps`.
+        acc: The sums for the M parameters of the maps, as `StepKernels.launch` adds them, in fours [lanes, M / 4];
+            set to 0.
+        maps: vec4 [M / 4], the maps; clamped to [0, 1], then updated.
         partial, partial_out, loss: Sums of P threads or blocks for hidden and output layers and losses, float [P, ...];
             set to 0 on the CPU, whose next step adds to them.
-        rates: As `update_maps` wrote them.
-        adam, adam_out: States of the optimisers of hidden and output layers, updated.
+        adam, adam_hidden, adam_out: States of the optimisers, updated.
         hidden, output: float, the hidden and output layers, updated.
         mean_loss: float [N], running mean of each tile's loss, updated.
         control: int [1], number of the step; increased by 1.
+        rounded: vec4, with `levels` written: the new endpoints and weights on the levels of the file, at their places.
+        frozen: Whether only the networks are updated.
+        levels: Whether `rounded` is written.
+        lane, lanes: This launch updates one of so many parts of all parameters; lane 0 counts the step.
     """
-    clear, sums = int(partial.device.is_cpu), (partial, partial_out, loss)
+    total = hidden.shape[0] + output.shape[0] + mean_loss.shape[0] + (0 if frozen else maps.shape[0])
+    span = -(-total // lanes)
+    sums = [acc, adam, maps, partial, adam_hidden, hidden, partial_out, adam_out, output, loss, mean_loss, control]
     wp.launch(
-        _update_net,
-        max(hidden.shape[0], output.shape[0], mean_loss.shape[0]),
-        inputs=[rates, clear, *sums, adam, adam_out, hidden, output, mean_loss, control],
-        device=partial.device,
+        _update,
+        max(0, min(span, total - lane * span)),
+        inputs=[rates, offsets, int(levels), lane * span, int(maps.device.is_cpu), *sums],
+        outputs=[rounded],
+        device=maps.device,
     )

@@ -2,7 +2,7 @@
 
 It handles B random samples of each of N tiles (neural-dynamic-gi, section 3.3, 3.4 and 4): draws a valid texel and a
 time, samples F_uv, F_uvt, F_ut and F_vt, adds the uniform noise of eq. 6, centres the features, runs the network,
-computes the weighted squared error and sums the gradients. `gather` turns the sums into gradient arrays.
+computes the weighted squared error and sums the gradients. `gather` turns the sums into gradients.
 
 On CUDA, networks run on the matrix units in half floats (`matrix_step`), on the CPU in float32.
 
@@ -34,6 +34,7 @@ from wlm_kernels.lightmap.features import (
     texel_weight,
     track_error,
     volume_at,
+    write_rates,
 )
 from wlm_kernels.lightmap.matrix_step import BLOCK, matrix_network
 
@@ -211,6 +212,8 @@ def step_kernels(hidden: int, gelu: str, device_kind: str) -> StepKernels:
         ):
             n, i = wp.tid()
             b = base + i
+            if n == 0 and b == 0:
+                write_rates(batch)
             lane = wp.where(base == 0, 0, 1)
             sample = draw_sample(batch, n, b, samples)
             k = sample.k
@@ -237,7 +240,8 @@ def step_kernels(hidden: int, gelu: str, device_kind: str) -> StepKernels:
                 partial_out[lane, n, c] += d3 * h2[c]
             partial[lane, n, wp.static(columns_2 + units)] += d2
             partial_out[lane, n, wp.static(units)] += d3
-            scatter(acc, lane, offsets, maps, batch, n, sample, back_input(hidden, n, d1))
+            if batch.frozen == 0:
+                scatter(acc, lane, offsets, maps, batch, n, sample, back_input(hidden, n, d1))
 
     else:
         network = matrix_network(hidden, gelu)
@@ -259,6 +263,8 @@ def step_kernels(hidden: int, gelu: str, device_kind: str) -> StepKernels:
             loss: wp.array1d[float],
         ):
             n, b = wp.tid()
+            if n == 0 and b == 0:
+                write_rates(batch)
             sample = draw_sample(batch, n, b, samples)
             k = sample.k
             f = features(maps, batch, n, sample.flat // 128, sample.flat % 128, k, sample.state)
@@ -272,6 +278,7 @@ def step_kernels(hidden: int, gelu: str, device_kind: str) -> StepKernels:
             g = vec_in()
             for c in range(wp.static(INPUTS)):
                 g[c] = r[c]
-            scatter(acc, 0, offsets, maps, batch, n, sample, g)
+            if batch.frozen == 0:
+                scatter(acc, 0, offsets, maps, batch, n, sample, g)
 
     return StepKernels(net, scalar, draw, step)
