@@ -10,7 +10,7 @@ from reference.levels import put_on_levels
 
 from kernels.compare import array, close
 from kernels.stepping import Case, fused_step, trainer
-from wlm_kernels.lightmap import features, gather, levels
+from wlm_kernels.lightmap import features, gather, levels, wide
 
 RATES = {"map_rate": 0.02, "net_rate": 0.005, "final_rate": 0.1}
 
@@ -78,7 +78,7 @@ def test_integer_sums_are_those_of_floats(device: str):
     values, sums = random.uniform(-0.2, 1.2, 48).astype(np.float32), random.normal(size=48).astype(np.float32)
     rates, control = array(np.array([0.02, 0.01, 10.0, 10.0], np.float32), float, device), array([0], int, device)
     none = [wp.zeros((1, 0), dtype=float, device=device), gather.Adam(), wp.zeros(0, dtype=float, device=device)]
-    for four, stored in ((wp.vec4, sums), (gather.vec4l, np.round(sums * 2.0**40).astype(np.int64))):
+    for four, stored in ((wp.vec4, sums), (wide.vec4l, np.round(sums * 2.0**40).astype(np.int64))):
         adam, offsets = gather.AdamOfFours(), features.Offsets()
         maps, adam.first, adam.second = (
             array(each.reshape(-1, 4), wp.vec4, device) for each in (values, 0 * values, 0 * values)

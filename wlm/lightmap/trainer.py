@@ -20,7 +20,7 @@ from wlm.formats.parts import Part, check_part, check_parts
 from wlm.lightmap.profile import Profile, TimeAxis, encode_time
 from wlm.lightmap.tiles import TILE, TileCut
 from wlm.workers import each
-from wlm_kernels.lightmap import blocks, features, gather, levels
+from wlm_kernels.lightmap import blocks, features, gather, levels, wide
 from wlm_kernels.lightmap import step as lightmap_step
 from wlm_kernels.lightmap.features import INPUTS
 
@@ -237,7 +237,7 @@ class Trainer:
             wrap(self._partial_out.view(parts, -1)),
             wrap(self._loss_parts),
         )
-        fours = wrap(self._acc.view(lanes, -1, 4), gather.vec4l if self._cuda else wp.vec4)
+        fours = wrap(self._acc.view(lanes, -1, 4), wide.vec4l if self._cuda else wp.vec4)
         # The arguments of `gather.update`.
         arguments: list = [wrap(self._rates), self._offsets, fours, adams[0], wrap(self.maps.view(-1, 4), wp.vec4)]
         for sums, moments, values in zip(net_sums, adams[1:], nets, strict=False):

@@ -15,6 +15,8 @@ times). Blocks of the file are `[S, H/4, W/4, 2]` of uint64, the low and the hig
 
 import warp as wp
 
+from wlm_kernels.lightmap.wide import endpoint_at
+
 wp.set_module_options({"enable_backward": False})
 
 
@@ -107,8 +109,8 @@ def texel(
     endpoints: wp.array4d[wp.vec4], weights: wp.array3d[float], s: int, y: int, x: int, quantised: int
 ) -> wp.vec4:
     """Returns the texel (y, x) of slice s of a map in training, from its endpoints and weights."""
-    e0 = ste_endpoint(endpoints[s, y // 4, x // 4, 0], quantised)
-    e1 = ste_endpoint(endpoints[s, y // 4, x // 4, 1], quantised)
+    e0 = ste_endpoint(endpoint_at(endpoints, s, y // 4, x // 4, 0), quantised)
+    e1 = ste_endpoint(endpoint_at(endpoints, s, y // 4, x // 4, 1), quantised)
     return ste_mix(e0, e1, ste_weight(weights[s, y, x], quantised), quantised)
 
 

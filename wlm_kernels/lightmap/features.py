@@ -15,6 +15,7 @@ import warp as wp
 
 from wlm_kernels.interpolate import axis_index, cell, fraction
 from wlm_kernels.lightmap.blocks import texel
+from wlm_kernels.lightmap.wide import two_at
 
 INPUTS, MAP_INPUTS = 16, 12
 """Inputs of a network, and those of them that come from the maps; the encoded time follows."""
@@ -72,8 +73,12 @@ def plane_at(plane: wp.array3d[wp.vec2], n: int, p: float, tau: float, periodic:
     xb = axis_index(x + 1, columns, 0)
     ta = axis_index(t, rows, periodic)
     tb = axis_index(t + 1, rows, periodic)
-    early = (1.0 - fx) * ste_byte2(plane[n, ta, xa], quantised) + fx * ste_byte2(plane[n, ta, xb], quantised)
-    late = (1.0 - fx) * ste_byte2(plane[n, tb, xa], quantised) + fx * ste_byte2(plane[n, tb, xb], quantised)
+    early = (1.0 - fx) * ste_byte2(two_at(plane, n, ta, xa), quantised) + fx * ste_byte2(
+        two_at(plane, n, ta, xb), quantised
+    )
+    late = (1.0 - fx) * ste_byte2(two_at(plane, n, tb, xa), quantised) + fx * ste_byte2(
+        two_at(plane, n, tb, xb), quantised
+    )
     return (1.0 - ft) * early + ft * late
 
 

@@ -9,11 +9,9 @@ import warp as wp
 
 from wlm_kernels.lightmap.blocks import ste_endpoint, ste_weight
 from wlm_kernels.lightmap.features import Offsets
+from wlm_kernels.lightmap.wide import four_at, put_four, take_four, vec4l
 
 wp.set_module_options({"enable_backward": False})
-
-vec4l = wp.types.vector(4, wp.int64)
-"""Four sums of a GPU, in steps of 2^-40, as `adjoint` adds them."""
 
 
 @wp.func
@@ -39,9 +37,7 @@ def _drain_four(sums: wp.array2d[wp.vec4], i: int) -> wp.vec4:
 
 @wp.func
 def _drain_four(sums: wp.array2d[vec4l], i: int) -> wp.vec4:
-    s = sums[0, i]
-    sums[0, i] = vec4l()
-    return wp.vec4(float(s[0]), float(s[1]), float(s[2]), float(s[3])) * 9.094947017729282e-13
+    return take_four(sums, i) * 9.094947017729282e-13  # steps of 2^-40, as `adjoint` adds them
 
 
 @wp.struct
@@ -138,9 +134,9 @@ def _update(
         return
     t -= mean_loss.shape[0]
     # All reads come before the first write, for which they would wait.
-    value = maps[t]
-    first = adam.first[t]
-    second = adam.second[t]
+    value = four_at(maps, t)
+    first = four_at(adam.first, t)
+    second = four_at(adam.second, t)
     grad = _drain_four(acc, t)
     for c in range(4):
         v = wp.clamp(value[c], 0.0, 1.0)
@@ -148,17 +144,17 @@ def _update(
         value[c] = new[0]
         first[c] = new[1]
         second[c] = new[2]
-    maps[t] = value
-    adam.first[t] = first
-    adam.second[t] = second
+    put_four(maps, t, value)
+    put_four(adam.first, t, first)
+    put_four(adam.second, t, second)
     at = 4 * t
     if levels != 0 and at < offsets.ut:
         if at < offsets.uv_weights or (at >= offsets.uvt_endpoints and at < offsets.uvt_weights):
-            rounded[t] = ste_endpoint(value, 1)
+            put_four(rounded, t, ste_endpoint(value, 1))
         else:
-            rounded[t] = wp.vec4(
-                ste_weight(value[0], 1), ste_weight(value[1], 1), ste_weight(value[2], 1), ste_weight(value[3], 1)
-            )
+            for c in range(4):
+                value[c] = ste_weight(value[c], 1)
+            put_four(rounded, t, value)
 
 
 # Both forms are compiled with the module: the threads of a fit on the CPU would compile one at the same time.
