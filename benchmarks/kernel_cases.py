@@ -21,6 +21,7 @@ from benchmarks.lightmap_run_time import random_sheet
 from benchmarks.ops import make_sphere
 from benchmarks.probe_speed import many_probes
 from benchmarks.rivals.lightmap_torch import dynamic_targets
+from benchmarks.rivals.whole_tiles import fast_decoder
 from benchmarks.smoke import make_cloud
 from wlm import interop, ops
 from wlm.atlas.decode import Decoder as AtlasDecoder
@@ -33,7 +34,6 @@ from wlm.lightmap.data import from_arrays
 from wlm.lightmap.model import LightmapModel, Sheet
 from wlm.lightmap.profile import Profile as LightmapProfile
 from wlm.lightmap.profile import TimeAxis
-from wlm.lightmap.runtime import fast_decoder
 from wlm.lightmap.tiles import TILE
 from wlm.lightmap.trainer import Trainer as LightmapTrainer
 from wlm.lightmap.virtual.texture import VirtualTexture

@@ -9,7 +9,7 @@ The results table has these kinds of rows:
   "matrix" (the fast kernel on matrix units), all of profile M: error of the RGB9E5 output against the input, and
   largest error against a float64 decode in gamma space, relative to the largest colour that the tile can have.
 - method "texture", one row for each profile: the map as a renderer samples it, one RGB9E5 texture with all mips
-  (`wlm.lightmap.runtime`): its errors, and the time to decode it.
+  (`benchmarks.rivals.whole_tiles`): its errors, and the time to decode it.
 - method "pages", one row for each profile with networks: all pages of all mips as a virtual texture holds them, RGB9E5
   with a border of 4 texels, from one list (`wlm.lightmap.virtual`): errors of the texels of the map, the largest as for
   "exact", and the time to decode all pages.
@@ -39,6 +39,13 @@ from benchmarks.plot import Panel
 from benchmarks.rivals.lightmap import RIVALS, check_rival, encode_set, usual
 from benchmarks.rivals.lightmap_torch import PlainFit, dynamic_targets
 from benchmarks.rivals.whole_map import WholeMap
+from benchmarks.rivals.whole_tiles import (
+    ExactDecoder,
+    FrameDecoder,
+    MatrixDecoder,
+    TileDecoder,
+    fast_decoder,
+)
 from benchmarks.rows import Row
 from benchmarks.runner import Bench, Fit, Note, demo_data, expect_alone
 from wlm.errors import WlmError
@@ -50,13 +57,6 @@ from wlm.lightmap.evaluation import bits_per_texel, count_kinds
 from wlm.lightmap.fit import compress
 from wlm.lightmap.model import PACKED_KINDS, SheetModel
 from wlm.lightmap.profile import Profile, TimeAxis
-from wlm.lightmap.runtime import (
-    ExactDecoder,
-    FrameDecoder,
-    MatrixDecoder,
-    RuntimeDecoder,
-    fast_decoder,
-)
 from wlm.lightmap.tiles import TILE, TileGrid, TileKind, place
 from wlm.lightmap.view_scores import VIEWS, Tally, views_of
 from wlm.lightmap.virtual.texture import STRIDE, VirtualTexture
@@ -481,9 +481,9 @@ class _LightmapBench(Bench):
         worst = {"worst_seen": score.worst_seen, "worst_between": score.worst_between}
         return figures | {key: where["psnr"] for key, where in worst.items() if where is not None}
 
-    def _decoders(self, model: SheetModel, path: str, gelu: str | None) -> list[RuntimeDecoder]:
+    def _decoders(self, model: SheetModel, path: str, gelu: str | None) -> list[TileDecoder]:
         """Makes the decoders of all tiles with feature maps or stored frames; tiles of constant light need none."""
-        decoders: list[RuntimeDecoder] = []
+        decoders: list[TileDecoder] = []
         if (model.kind == TileKind.DYNAMIC).any():
             if path == "fast":
                 decoders.append(fast_decoder(model, self.device))
@@ -497,7 +497,7 @@ class _LightmapBench(Bench):
             decoder.set_time(self.times[0])
         return decoders
 
-    def _decode(self, decoders: Sequence[RuntimeDecoder]) -> Callable[[], object]:
+    def _decode(self, decoders: Sequence[TileDecoder]) -> Callable[[], object]:
         def decode() -> None:
             for decoder in decoders:
                 decoder.decode()
@@ -505,7 +505,7 @@ class _LightmapBench(Bench):
         # Without any launch there is nothing to capture.
         return self.replay(decode) if decoders else decode
 
-    def _decoded_tiles(self, model: SheetModel, decoders: Sequence[RuntimeDecoder], t: float) -> np.ndarray:
+    def _decoded_tiles(self, model: SheetModel, decoders: Sequence[TileDecoder], t: float) -> np.ndarray:
         """Decodes all tiles to RGB9E5 and returns their radiance."""
         tiles = np.zeros((self.grid.count, TILE, TILE, 3))
         for number in np.flatnonzero(model.kind == TileKind.CONSTANT).tolist():

@@ -56,7 +56,8 @@ _PAGES = {
         _Shown("jet-sphere", "time_ms"),
         _Shown("plumes, albedo 0.9", _ORDERS),
         _Shown("jet, albedo 1", _ORDERS),
-        _Shown("unseen smoke", "psnr time_ms", "time against error .*"),
+        _Shown("unseen smoke, 400³, 512² pixels", "time_ms psnr call_ms"),
+        _Shown("plume, 128³, 256² pixels", "time_ms psnr"),
     ],
     "kernels": [
         _Shown("cuda", "time_ms size floor_ms of_floor slope launches", last=True),

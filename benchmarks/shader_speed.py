@@ -1,4 +1,4 @@
-"""Speed of the exported shaders of lightmaps on a GPU, beside the decoders of `wlm.lightmap.runtime`.
+"""Speed of the exported shaders of lightmaps on a GPU, beside the decoders of `benchmarks.rivals.whole_tiles`.
 
 The map has 1024 x 1024 texels with random maps and networks. The rows:
 
@@ -30,6 +30,7 @@ from benchmarks.lightmap import ALL, PAGE_FRAMES, PAGES, texels_of, view_of_all_
 from benchmarks.lightmap_run_time import _PlainCamera, large_model, random_sheet
 from benchmarks.rivals.browser_run import page_time
 from benchmarks.rivals.gl_run import Screen
+from benchmarks.rivals.whole_tiles import fast_decoder
 from benchmarks.rows import Row
 from benchmarks.runner import Bench, Note
 from wlm.bundle import Bundle
@@ -40,7 +41,6 @@ from wlm.lightmap.bundle import sheet_bundle
 from wlm.lightmap.decode import SheetDecoder
 from wlm.lightmap.model import LightmapModel
 from wlm.lightmap.profile import Profile
-from wlm.lightmap.runtime import fast_decoder
 from wlm.lightmap.shader import GROUP_SIZE
 from wlm.lightmap.sheet import LIGHT, Sheet
 from wlm.lightmap.tiles import TILE

@@ -12,28 +12,17 @@ The tables are those of `wlm.formats.bc6h`; imagecodecs' decoder is the referenc
 
 import warp as wp
 
+from wlm_kernels import block_lines as lines
+
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 
-_TEXELS = wp.constant(16)
-_ALL = wp.constant(0xFFFF)
-_LARGEST = wp.constant(65504.0)
-_TOP = wp.constant(65535.0)
-_LEAST_NORMAL = wp.constant(6.103515625e-05)  # 2 ** -14
-_STRETCH = wp.constant(64.0 / 31.0)  # factor from a half float's bits to BC6H's 16-bit space
 _POWER_ROUNDS = wp.constant(4)
 _AXIS_ROUNDS = wp.constant(8)
-_REFINED = wp.constant(2)  # number of fits of a line to its texels' nearest indices
+_REFINED = wp.constant(2)  # number of fits of a line to its texels' lines.nearest indices
 _REFITTED = wp.constant(2)  # number of refits of a block's endpoints to its indices
 _TRIED = wp.constant(2)  # number of partitions tried that are encoded
-_LEAST_WEIGHT = wp.constant(1.0e-4)  # fraction of the largest texel weight
-_HUGE = wp.constant(3.4e38)
 
-_Colours = wp.types.matrix(shape=(16, 3), dtype=float)
-_Indices = wp.types.vector(length=16, dtype=int)
 _Codes = wp.types.matrix(shape=(4, 3), dtype=int)
-_Numbers = wp.types.vector(length=16, dtype=float)
-_Ends = wp.types.matrix(shape=(4, 3), dtype=float)
-_Moments = wp.types.vector(length=10, dtype=float)
 
 
 @wp.struct
@@ -61,195 +50,26 @@ class _Block:
     mode: int
     partition: int
     code: _Codes
-    index: _Indices
-    light: _Colours
-
-
-@wp.struct
-class _Texels:
-    """The target texels of a block: their linear light, the weights of their squared errors, and their colours in
-    BC6H's 16-bit space, not rounded.
-
-    `pull` is the weight of each channel's squared error in the 16-bit space, `middle` the mean of `place` over the
-    texels, and `metric` the scale of each channel's distance from it: the square root of the mean of `pull`.
-    """
-
-    light: _Colours
-    weight: _Numbers
-    place: _Colours
-    pull: _Colours
-    middle: wp.vec3
-    metric: wp.vec3
-
-
-@wp.struct
-class _Sums:
-    """The normal equations of a line's two ends, for each channel: sums over the texels, weighted, of products of their
-    interpolation weights a (first end) and b (second end), and of their colours (`place`) times a and b."""
-
-    aa: wp.vec3
-    ab: wp.vec3
-    bb: wp.vec3
-    ay: wp.vec3
-    by: wp.vec3
+    index: lines.Indices
+    light: lines.Colours
 
 
 @wp.func
-def _place_of(light: float) -> wp.vec2:
-    """Returns linear light converted to BC6H's 16-bit space, and the derivative of light by the result."""
-    if light < _LEAST_NORMAL:
-        return wp.vec2(light * 16777216.0 * _STRETCH, 1.0 / (16777216.0 * _STRETCH))
-    exponent = wp.floor(wp.log2(light))
-    scale = wp.pow(2.0, exponent)
-    # The logarithm may round to the next integer, where the curve has a kink but no step.
-    bits = 1024.0 * (exponent + 14.0 + light / scale)
-    return wp.vec2(wp.min(bits * _STRETCH, _TOP), scale / (1024.0 * _STRETCH))
-
-
-@wp.func
-def _in(mask: int, texel: int) -> bool:
-    return ((mask >> texel) & 1) == 1
-
-
-@wp.func
-def _axis_of(m: _Moments, rounds: int) -> wp.vec4:
-    """Computes the principal axis of points with the moments m, in `rounds` power iterations, and their scatter along
-    it."""
-    inverse = 1.0 / wp.max(m[0], 1.0e-30)
-    xx, xy, xz = m[4] - m[1] * m[1] * inverse, m[5] - m[1] * m[2] * inverse, m[6] - m[1] * m[3] * inverse
-    yy, yz, zz = m[7] - m[2] * m[2] * inverse, m[8] - m[2] * m[3] * inverse, m[9] - m[3] * m[3] * inverse
-    a = wp.mat33(xx, xy, xz, xy, yy, yz, xz, yz, zz)
-    axis = a[0]
-    if yy > xx and yy > zz:
-        axis = a[1]
-    elif zz > xx:
-        axis = a[2]
-    for _round in range(rounds):
-        length = wp.length(axis)
-        if length > 0.0:
-            axis = a * (axis / length)
-    length = wp.length(axis)
-    if length > 0.0:
-        axis = axis / length
-    value = wp.dot(axis, a * axis)
-    return wp.vec4(axis[0], axis[1], axis[2], wp.max(value, 0.0))
-
-
-@wp.func
-def _spread(m: _Moments) -> float:
-    """Computes the scatter of points with the moments m: the weighted sum of squared distances from the mean."""
-    inverse = 1.0 / wp.max(m[0], 1.0e-30)
-    return wp.max(m[4] + m[7] + m[9] - (m[1] * m[1] + m[2] * m[2] + m[3] * m[3]) * inverse, 0.0)
-
-
-@wp.func
-def _scaled(texels: _Texels, texel: int) -> wp.vec3:
-    """Returns a texel's colour in the 16-bit space relative to the block's mean, scaled by `texels.metric`."""
-    return wp.cw_mul(texels.place[texel] - texels.middle, texels.metric)
-
-
-@wp.func
-def _moments(texels: _Texels, mask: int) -> _Moments:
-    """Sums weights, weighted colours (`_scaled`) and their six weighted channel products over the texels in `mask`."""
-    total = _Moments()
-    square = wp.cw_mul(texels.metric, texels.metric)
-    for i in range(_TEXELS):
-        if _in(mask, i):
-            point = _scaled(texels, i)
-            x, y, z = point[0], point[1], point[2]
-            weight = wp.dot(wp.cw_div(texels.pull[i], square), wp.vec3(1.0 / 3.0))
-            total += weight * _Moments(1.0, x, y, z, x * x, x * y, x * z, y * y, y * z, z * z)
-    return total
-
-
-@wp.func
-def _fitted(texels: _Texels, mask: int, ends: _Ends, line: int, moments: _Moments, steps: int) -> _Ends:
-    """Fits a line to the texels in `mask`, a bit each: the extremes along their principal axis, refined twice by least
-    squares.
+def _fitted(
+    texels: lines.Texels, mask: int, ends: lines.Ends, line: int, moments: lines.Moments, steps: int
+) -> lines.Ends:
+    """Fits a line to the texels in `mask`: the extremes along their principal axis, refined twice by least squares.
 
     Of the endpoints of both lines, rows 2 `line` and 2 `line` + 1 are replaced. `moments` are those of these texels;
     `steps` is the largest index, which selects the line's second end.
     """
-    principal = _axis_of(moments, _AXIS_ROUNDS)
-    axis = wp.vec3(principal[0], principal[1], principal[2])
-    low = float(_HUGE)
-    high = float(-_HUGE)
-    for i in range(_TEXELS):
-        if _in(mask, i):
-            t = wp.dot(_scaled(texels, i), axis)
-            low = wp.min(low, t)
-            high = wp.max(high, t)
-    mean = wp.vec3(moments[1], moments[2], moments[3]) / wp.max(moments[0], 1.0e-30)
-    centre = wp.dot(mean, axis)
-    a = texels.middle + wp.cw_div(mean + axis * (low - centre), texels.metric)
-    b = texels.middle + wp.cw_div(mean + axis * (high - centre), texels.metric)
+    axis, _scatter = lines.axis_of(moments, _AXIS_ROUNDS)
+    a, b = lines.extremes(texels, mask, moments, axis)
     for _round in range(_REFINED):
-        a, b = _regressed(texels, mask, a, b, steps)
+        a, b = lines.ends_of(lines.sums_of(texels, mask, lines.nearest(texels, mask, a, b, steps)), a, b)
     ends[2 * line] = a
     ends[2 * line + 1] = b
     return ends
-
-
-@wp.func
-def _solved(products: wp.vec3, right: wp.vec2, before: wp.vec2) -> wp.vec2:
-    """Solves for the two ends of a channel within the format's range; returns `before` if they are underdetermined."""
-    aa, ab, bb = products[0], products[1], products[2]
-    determinant = aa * bb - ab * ab
-    if not (determinant > 1.0e-5 * aa * bb and determinant > 0.0):
-        return wp.vec2(wp.clamp(before[0], 0.0, _TOP), wp.clamp(before[1], 0.0, _TOP))
-    a = (right[0] * bb - right[1] * ab) / determinant
-    b = (right[1] * aa - right[0] * ab) / determinant
-    # Where one end is clamped to the range, the other is optimal given it.
-    if a < 0.0 or a > _TOP:
-        a = wp.clamp(a, 0.0, _TOP)
-        b = (right[1] - ab * a) / wp.max(bb, 1.0e-30)
-    elif b < 0.0 or b > _TOP:
-        b = wp.clamp(b, 0.0, _TOP)
-        a = (right[0] - ab * b) / wp.max(aa, 1.0e-30)
-    return wp.vec2(wp.clamp(a, 0.0, _TOP), wp.clamp(b, 0.0, _TOP))
-
-
-@wp.func
-def _added(sums: _Sums, pull: wp.vec3, place: wp.vec3, t: float) -> _Sums:
-    """Adds a texel to the normal equations; `t` is its interpolation weight of the second end."""
-    s = 1.0 - t
-    sums.aa += pull * (s * s)
-    sums.ab += pull * (s * t)
-    sums.bb += pull * (t * t)
-    weighted = wp.cw_mul(pull, place)
-    sums.ay += weighted * s
-    sums.by += weighted * t
-    return sums
-
-
-@wp.func
-def _ends_of(sums: _Sums, a: wp.vec3, b: wp.vec3):
-    """Solves the normal equations for a line's ends; `a` and `b` are the previous ends."""
-    for c in range(3):
-        products = wp.vec3(sums.aa[c], sums.ab[c], sums.bb[c])
-        pair = _solved(products, wp.vec2(sums.ay[c], sums.by[c]), wp.vec2(a[c], b[c]))
-        a[c] = pair[0]
-        b[c] = pair[1]
-    return a, b
-
-
-@wp.func
-def _regressed(texels: _Texels, mask: int, a: wp.vec3, b: wp.vec3, steps: int):
-    """Fits a line's ends by least squares, with each texel at its nearest index between the previous ends."""
-    along = b - a
-    sums = _Sums()
-    for i in range(_TEXELS):
-        if _in(mask, i):
-            pull = texels.pull[i]
-            scaled = wp.cw_mul(pull, along)
-            square = wp.dot(scaled, along)
-            t = float(0.0)
-            if square > 0.0:
-                t = wp.dot(scaled, texels.place[i] - a) / square
-            t = wp.clamp(wp.floor(t * float(steps) + 0.5), 0.0, float(steps)) / float(steps)
-            sums = _added(sums, pull, texels.place[i], t)
-    a, b = _ends_of(sums, a, b)
-    return a, b
 
 
 @wp.func
@@ -264,7 +84,7 @@ def _whole(code: int, bits: int) -> int:
 
 @wp.func
 def _coded(place: float, bits: int) -> int:
-    """Returns the code of `bits` bits that expands to the 16-bit value nearest to `place`."""
+    """Returns the code of `bits` bits that expands to the 16-bit value lines.nearest to `place`."""
     top = (1 << bits) - 1
     if bits == 16:
         return wp.clamp(int(place + 0.5), 0, top)
@@ -283,7 +103,7 @@ def _share(index: int, steps: int) -> int:
 
 
 @wp.func
-def _finest(tables: Tables, ends: _Ends, first: int, last: int, count: int) -> int:
+def _finest(tables: Tables, ends: lines.Ends, first: int, last: int, count: int) -> int:
     """Finds the most precise of the modes `first` to `last` - 1 that can store the first `count` ends; -1 if none can.
     Most modes store all ends but the first as differences to it, which have fewer bits."""
     best = int(-1)
@@ -303,23 +123,23 @@ def _finest(tables: Tables, ends: _Ends, first: int, last: int, count: int) -> i
 
 
 @wp.func
-def _encoded(texels: _Texels, tables: Tables, ends: _Ends, mode: int, partition: int) -> _Block:
+def _encoded(texels: lines.Texels, tables: Tables, ends: lines.Ends, mode: int, partition: int) -> _Block:
     """Encodes a block in a mode: rounds the ends and chooses the index with the least error for each texel."""
     block = _Block()
     block.mode = mode
     block.partition = partition
     bits = tables.modes[mode, 3]
-    lines = int(1)
+    count = int(1)
     mask = int(0)
     anchor = int(0)
     steps = int(15)
     if mode < 10:
-        lines = 2
+        count = 2
         mask = tables.masks[partition]
         anchor = tables.anchors[partition]
         steps = 7
-    palette = _Colours()
-    for line in range(lines):
+    palette = lines.Colours()
+    for line in range(count):
         for c in range(3):
             block.code[2 * line, c] = _coded(ends[2 * line][c], bits)
             block.code[2 * line + 1, c] = _coded(ends[2 * line + 1][c], bits)
@@ -330,14 +150,14 @@ def _encoded(texels: _Texels, tables: Tables, ends: _Ends, mode: int, partition:
                 mixed = ((64 - share) * low + share * high + 32) >> 6
                 palette[8 * line + k, c] = tables.halves[(mixed * 31) >> 6]
     error = float(0.0)
-    for i in range(_TEXELS):
+    for i in range(lines.TEXELS):
         start = int(0)
-        if _in(mask, i):
+        if lines.in_mask(mask, i):
             start = 8
         last = steps
-        if i == 0 or (lines == 2 and i == anchor):
+        if i == 0 or (count == 2 and i == anchor):
             last = steps // 2
-        best = float(_HUGE)
+        best = float(lines.HUGE)
         index = int(0)
         for k in range(last + 1):
             away = palette[start + k] - texels.light[i]
@@ -353,7 +173,7 @@ def _encoded(texels: _Texels, tables: Tables, ends: _Ends, mode: int, partition:
 
 
 @wp.func
-def _turned(texels: _Texels, ends: _Ends, line: int, anchor: int) -> _Ends:
+def _turned(texels: lines.Texels, ends: lines.Ends, line: int, anchor: int) -> lines.Ends:
     """Swaps a line's ends if that brings the first end nearer to the anchor texel, whose index has one bit less."""
     a, b = ends[2 * line], ends[2 * line + 1]
     pull = texels.pull[anchor]
@@ -365,62 +185,35 @@ def _turned(texels: _Texels, ends: _Ends, line: int, anchor: int) -> _Ends:
 
 
 @wp.func
-def _refitted(texels: _Texels, block: _Block, mask: int, ends: _Ends, line: int, steps: int) -> _Ends:
+def _refitted(texels: lines.Texels, block: _Block, mask: int, ends: lines.Ends, line: int, steps: int) -> lines.Ends:
     """Refits the ends of a line by least squares to the indices of its texels."""
-    sums = _Sums()
-    for i in range(_TEXELS):
-        if _in(mask, i):
-            t = float(_share(block.index[i], steps)) / 64.0
-            sums = _added(sums, texels.pull[i], texels.place[i], t)
-    a, b = _ends_of(sums, ends[2 * line], ends[2 * line + 1])
+    shares = lines.Numbers()
+    for i in range(lines.TEXELS):
+        shares[i] = float(_share(block.index[i], steps)) / 64.0
+    a, b = lines.ends_of(lines.sums_of(texels, mask, shares), ends[2 * line], ends[2 * line + 1])
     ends[2 * line] = a
     ends[2 * line + 1] = b
     return ends
 
 
 @wp.func
-def _gathered(light: wp.array2d[wp.vec3], weight: wp.array2d[float], number: int) -> _Texels:
-    texels = _Texels()
-    heaviest = float(0.0)
-    for i in range(_TEXELS):
-        heaviest = wp.max(heaviest, weight[number, i])
-    metric = wp.vec3(0.0)
-    for i in range(_TEXELS):
-        # A texel without weight gets a very small weight, since interpolation still reads it.
-        w = float(1.0)
-        if heaviest > 0.0:
-            w = wp.max(weight[number, i] / heaviest, _LEAST_WEIGHT)
-        texels.weight[i] = w
-        for c in range(3):
-            value = wp.clamp(light[number, i][c], 0.0, _LARGEST)
-            place = _place_of(value)
-            texels.light[i, c] = value
-            texels.place[i, c] = place[0]
-            texels.pull[i, c] = w * place[1] * place[1]
-        texels.middle += texels.place[i] / float(_TEXELS)
-        metric += texels.pull[i] / float(_TEXELS)
-    for c in range(3):
-        texels.metric[c] = wp.sqrt(wp.max(metric[c], 1.0e-6 * wp.max(metric)))
-    return texels
-
-
-@wp.func
-def _split(texels: _Texels, tables: Tables, whole: _Moments, tried: int) -> wp.vec2:
+def _split(texels: lines.Texels, tables: Tables, whole: lines.Moments, tried: int) -> wp.vec2:
     """Finds the partition, among those not in the bit mask `tried`, whose two lines fit best. Returns its number and
     the expected weighted sum of squared errors."""
-    least = float(_HUGE)
+    least = float(lines.HUGE)
     partition = int(0)
     for p in range(32):
         if ((tried >> p) & 1) == 0:
-            second = _moments(texels, tables.masks[p])
+            second = lines.moments_of(texels, tables.masks[p])
             left = float(0.0)
             along = float(0.0)
             for line in range(2):
                 part = second
                 if line == 0:
                     part = whole - second
-                left += _spread(part)
-                along += _axis_of(part, _POWER_ROUNDS)[3]
+                left += lines.spread(part)
+                _axis, scatter = lines.axis_of(part, _POWER_ROUNDS)
+                along += scatter
             # An index of three bits leaves 1/49 of the scatter along a line.
             left = left - along * (48.0 / 49.0)
             if left < least:
@@ -456,7 +249,7 @@ def _write_block(number: int, block: _Block, tables: Tables, blocks: wp.array2d[
     place = int(65)
     if mode < 10:
         place = 82
-    for i in range(_TEXELS):
+    for i in range(lines.TEXELS):
         own = width
         if i == 0 or i == anchor:
             own = width - 1
@@ -484,15 +277,16 @@ def _encode(
     copies of a function took the CUDA compiler half a minute.
     """
     number = wp.tid()
-    texels = _gathered(light, weight, number)
-    whole = _moments(texels, _ALL)
+    texels = lines.gathered(light, weight, number, False)
+    whole = lines.moments_of(texels, lines.ALL)
     # An index of four bits leaves 1/225 of the scatter along a line.
-    alone = _spread(whole) - _axis_of(whole, _AXIS_ROUNDS)[3] * (224.0 / 225.0)
+    _axis, along = lines.axis_of(whole, _AXIS_ROUNDS)
+    alone = lines.spread(whole) - along * (224.0 / 225.0)
     best = _Block()
-    best.error = _HUGE
+    best.error = lines.HUGE
     tried = int(0)  # one bit per partition
     for attempt in range(1 + _TRIED):  # one line, then two
-        lines = int(1)
+        count = int(1)
         steps = int(15)
         partition = int(0)
         mask = int(0)
@@ -505,19 +299,19 @@ def _encode(
             partition = int(split[0])
             tried = tried | (1 << partition)
             promising = split[1] < alone
-            lines = 2
+            count = 2
             steps = 7
             mask = tables.masks[partition]
             anchor = tables.anchors[partition]
             first_mode = 0
             last_mode = 10
         if promising:
-            second = _moments(texels, mask)
-            ends = _Ends()
+            second = lines.moments_of(texels, mask)
+            ends = lines.Ends()
             block = _Block()
             for round in range(1 + _REFITTED):
-                for line in range(lines):
-                    own = _ALL ^ mask
+                for line in range(count):
+                    own = lines.ALL ^ mask
                     part = whole - second
                     start = int(0)
                     if line == 1:
@@ -529,13 +323,13 @@ def _encode(
                     else:
                         ends = _refitted(texels, block, own, ends, line, steps)
                     ends = _turned(texels, ends, line, start)
-                mode = _finest(tables, ends, first_mode, last_mode, 2 * lines)
+                mode = _finest(tables, ends, first_mode, last_mode, 2 * count)
                 block = _encoded(texels, tables, ends, mode, partition)
                 if block.error < best.error:
                     best = block
-                if lines == 1:
+                if count == 1:
                     block = best
-    for i in range(_TEXELS):
+    for i in range(lines.TEXELS):
         decoded[number, i] = best.light[i]
     _write_block(number, best, tables, blocks)
 

@@ -43,25 +43,3 @@ def pack_rgb9e5(light: wp.vec3) -> wp.uint32:
     word = word | wp.lshift(wp.uint32(int(wp.floor(g * scale + 0.5))), wp.uint32(9))
     word = word | wp.lshift(wp.uint32(int(wp.floor(b * scale + 0.5))), wp.uint32(18))
     return word | wp.lshift(wp.uint32(exponent), wp.uint32(27))
-
-
-@wp.kernel
-def _pack_mean(
-    # in:
-    early: wp.array3d[wp.vec3],
-    late: wp.array3d[wp.vec3],
-    share: float,
-    # out:
-    out: wp.array3d[wp.uint32],
-):
-    i, y, x = wp.tid()
-    light = early[i, y, x]
-    if share > 0.0:
-        light = (1.0 - share) * light + share * late[i, y, x]
-    out[i, y, x] = pack_rgb9e5(light)
-
-
-def pack_mean(early: wp.array, late: wp.array, share: float, out: wp.array) -> None:
-    """Interpolates linear radiance between two times, vec3 [n, h, w] each, and packs it into `out`, uint32 [n, h, w].
-    `share` is the weight of the later time, 0 to 1."""
-    wp.launch(_pack_mean, out.shape, inputs=[early, late, share], outputs=[out], device=out.device)

@@ -20,6 +20,7 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
+from benchmarks.rivals import astcenc
 from benchmarks.rivals.lightmap_blocks import ispc_bc6h
 from benchmarks.rivals.rival import Rival
 from wlm.atlas.colour import quantise
@@ -89,7 +90,7 @@ def block_codec(scene: LightmappedScene, share: float, codec: str) -> Rival:
         data = ispc_bc6h(padded)
         decoded = hdr_blocks.decode_bc6h(data, *padded.shape[:2], _EXTRA)[:height, :width]
     else:
-        coder = hdr_blocks.astc(block, hdr_blocks.ASTC_MEDIUM, _EXTRA)
+        coder = astcenc.astc(block, astcenc.MEDIUM, _EXTRA)
         data = coder.encode(half)
         decoded = coder.decode(data, height, width)
     return _texture(codec, decoded, count * _BLOCK_BITS // 8, start)

@@ -19,6 +19,7 @@ from types import ModuleType
 
 import numpy as np
 
+from benchmarks.rivals import astcenc
 from benchmarks.rivals.lightmap_levels import TileRanges, clear_unseen, prepare, seen_texels, to_codes
 from benchmarks.rivals.rival import EXTRA, Rival, disk_size, measure, need_bc
 from wlm.errors import WlmError
@@ -120,12 +121,12 @@ def _astc(image: np.ndarray, mask: np.ndarray, block: int, profile: str) -> Riva
 
 
 @functools.cache
-def _astc_codec(codec: ModuleType, block: int, ldr: bool) -> hdr_blocks.Astc:
+def _astc_codec(codec: ModuleType, block: int, ldr: bool) -> astcenc.Astc:
     profile = codec.ASTCProfile.LDR if ldr else codec.ASTCProfile.HDR_RGB_LDR_A
     config = codec.ASTCConfig(profile, block, block, 1, _ASTC_THOROUGH)
     if ldr:
         config.tune_db_limit = _NO_LIMIT_DB  # the HDR profile has no such limit
-    return hdr_blocks.Astc(codec, config)
+    return astcenc.Astc(codec, config)
 
 
 def _measured(

@@ -3,10 +3,10 @@
 import numpy as np
 import warp as wp
 
+from benchmarks.rivals.whole_tiles import FrameDecoder, TileDecoder, fast_decoder
 from wlm.formats.shared_exponent import unpack_rgb9e5
 from wlm.lightmap.encodings.constant import ConstantTiles
 from wlm.lightmap.model import SheetModel
-from wlm.lightmap.runtime import FrameDecoder, RuntimeDecoder, fast_decoder
 from wlm.lightmap.tiles import TILE, TileKind
 from wlm.texels import near_gaps
 from wlm_kernels.shared_exponent import pack_rgb9e5 as pack_kernel
@@ -148,9 +148,9 @@ def _halved(weight: np.ndarray) -> np.ndarray:
     return weight
 
 
-def _tile_decoders(model: SheetModel, device: str) -> list[RuntimeDecoder]:
+def _tile_decoders(model: SheetModel, device: str) -> list[TileDecoder]:
     """Makes the fastest decoder to RGB9E5 of each kind of tile that a sheet has; constant tiles need none."""
-    decoders: list[RuntimeDecoder] = []
+    decoders: list[TileDecoder] = []
     if (model.kind == TileKind.DYNAMIC).any():
         decoders.append(fast_decoder(model, device))
     if (model.kind == TileKind.FRAMES).any():

@@ -332,4 +332,4 @@ def test_the_range_is_clamped(codec):
 def test_a_missing_package_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "astc_encoder", None)  # makes the import fail
     with pytest.raises(WlmError, match=r"astc_encoder is missing.*wlm\[atlas\]"):
-        encode(_smooth(8, 8), "astc")
+        decode(np.zeros((1, 16), np.uint8), 4, 4, "astc")

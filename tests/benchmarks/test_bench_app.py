@@ -1,6 +1,7 @@
 """`python -m benchmarks`: the options of every measuring command reach its `run`, and errors are one line."""
 
 import json
+import shlex
 from pathlib import Path
 
 import pytest
@@ -10,77 +11,32 @@ from typer.testing import CliRunner
 from benchmarks import Row, describe_environment, read_json, write_json
 from benchmarks.app import _COMMANDS, app
 
-# The words of a command; the command that the result file states, where it differs; and some arguments of `run`.
-COMMANDS = [
-    (["lightmap", "--set", "a/city"], "lightmap --device cpu --set city", {"set_path": Path("a/city"), "quick": False}),
-    (
-        ["lightmap", "--quick", "--profile", "M", "--profile", "a/b.yaml", "--no-rivals"],
-        "lightmap --quick --profile M --profile b.yaml --no-rivals --device cpu",
-        {"profiles": ["M", "a/b.yaml"], "rivals": False, "rivals_only": False, "rival_names": None},
-    ),
-    (["lightmap", "--rivals-only"], "lightmap --rivals-only --device cpu", {"rivals_only": True, "rivals": True}),
-    (["lightmap", "--rival", "bc7"], "lightmap --rival bc7 --device cpu", {"rival_names": ["bc7"]}),
-    (
-        ["lightmap-ablation", "--quick", "--set", "city", "--steps", "20", "--only", "3D alone"],
-        "lightmap-ablation --quick --device cpu --set city --steps 20 --only '3D alone'",
-        {"only": ["3D alone"], "steps": 20},
-    ),
-    (
-        ["lightmap-run-time", "--set", "a/city", "--quick"],
-        "lightmap-run-time --set city --quick --device cpu",
-        {"walked_path": Path("a/city"), "quick": True},
-    ),
-    (
-        ["probe", "--probes", "a/room.npz", "--key", "sh", "--key", "sh_noon"],
-        "probe --device cpu --probes room.npz --key sh --key sh_noon",
-        {"keys": ["sh", "sh_noon"], "quick": False, "volume_only": False, "table": False},
-    ),
-    (
-        ["probe", "--table", "--only", "ours", "--nearest", "8", "--nearest", "40"],
-        "probe --table --only ours --nearest 8 --nearest 40 --device cpu",
-        {"table": True, "only": ["ours"], "nearest": [8, 40]},
-    ),
-    (["probe", "--mesh", "a/b.glb"], "probe --mesh b.glb --device cpu", {"lit_path": Path("a/b.glb"), "table": False}),
-    (
-        ["probe", "--speed", "--many", "900"],
-        "probe --speed --many 900 --device cpu",
-        {"speed": True, "many": 900, "probes_path": None},
-    ),
-    (["probe", "--volume-only"], "probe --volume-only --device cpu", {"volume_only": True}),
-    (
-        ["atlas", "--quick", "--meshes", "a/Cube", "--profile", "astc"],
-        "atlas --quick --device cpu --meshes Cube --profile astc",
-        {"meshes_path": Path("a/Cube"), "profiles": ["astc"], "rivals": True},
-    ),
-    (
-        ["atlas-scene", "--set", "town", "--hour", "6", "--side", "48", "--quick", "--budget", "0.1", "--no-parts"],
-        "atlas-scene --set town --hour 6.0 --side 48 --budget 0.1 --no-parts --quick --device cpu",
-        {"scene_path": Path("town"), "hours": [6.0], "side": 48, "budget": 0.1, "parts": False},
-    ),
-    (
-        ["atlas-ablation", "--quick", "--profile", "cascade", "--only", "ASTC", "--steps", "9"],
-        "atlas-ablation --quick --profile cascade --device cpu --steps 9 --only ASTC",
-        {"profile": "cascade", "only": ["ASTC"], "steps": 9},
-    ),
-    (
-        ["kernels", "--quick", "--only", "atlas, read"],
-        "kernels --quick --device cpu --only 'atlas, read'",
-        {"quick": True},
-    ),
-    (["smoke-orders"], "smoke-orders --device cpu", {"quick": False}),
-    (
-        ["smoke-network", "--network", "a/young.safetensors", "--profile", "paper"],
-        "smoke-network --device cpu --network young.safetensors --profile paper",
-        {"networks": [Path("a/young.safetensors")], "profiles": ["paper"]},
-    ),
-    (["smoke-sizes", "--volume", "b.vdb"], "smoke-sizes --volume b.vdb --device cpu", {"smoke_path": Path("b.vdb")}),
-    (["kernels-profile", "--only", "rasterize"], "kernels-profile --device cpu --only rasterize", {}),
-    (["ops", "--only", "plane"], "ops --device cpu --only plane", {"only": ["plane"]}),
-    *(
-        ([name, "--quick"], f"{name} --quick --device cpu", {"quick": True})
-        for name in ("shader-speed", "scene", "lightmap-file", "smoke", "growth", "fluid-gradients")
-    ),
-]
+# Words that set each option, and the argument of `run` that they give; result files name files without their folders.
+OPTIONS = {
+    **{
+        flag.replace("-", "_"): ([f"--{flag}"], True)
+        for flag in ("quick", "rivals-only", "speed", "table", "volume-only")
+    },
+    **{name: ([f"--no-{name}"], False) for name in ("rivals", "parts")},
+    "profiles": (["--profile", "M", "--profile", "a/b.yaml"], ["M", "a/b.yaml"]),
+    "profile": (["--profile", "cascade"], "cascade"),
+    "rival_names": (["--rival", "bc7"], ["bc7"]),
+    "keys": (["--key", "sh", "--key", "sh_noon"], ["sh", "sh_noon"]),
+    "only": (["--only", "3D alone"], ["3D alone"]),
+    "nearest": (["--nearest", "8", "--nearest", "40"], [8, 40]),
+    "hours": (["--hour", "6.0"], [6.0]),
+    "budget": (["--budget", "0.1"], 0.1),
+    **{name: ([f"--{name}", "9"], 9) for name in ("many", "side", "steps")},
+    **{f"{name}_path": ([f"--{name}", f"a/{name}"], Path("a", name)) for name in ("probes", "meshes", "mesh", "mask")},
+    **{name: (["--set", "a/city"], Path("a/city")) for name in ("set_path", "walked_path", "scene_path")},
+    "lit_path": (["--mesh", "a/b.glb"], Path("a/b.glb")),
+    "lightmap_paths": (["--lightmap", "a/b.exr"], [Path("a/b.exr")]),
+    "smoke_path": (["--volume", "b.vdb"], Path("b.vdb")),
+    "networks": (["--network", "a/young.safetensors"], [Path("a/young.safetensors")]),
+    "baseline_path": (["--baseline", "a/old.json"], Path("a/old.json")),
+    "plot_path": (["--plot", "a/b.png"], Path("a/b.png")),
+    "device": (["--device", "cpu"], "cpu"),
+}
 
 
 def call(*words, code=0) -> str:
@@ -89,15 +45,18 @@ def call(*words, code=0) -> str:
     return result.output
 
 
-@pytest.mark.parametrize(("words", "command", "arguments"), COMMANDS, ids=lambda value: " ".join(value)[:40])
-def test_options_reach_the_run_and_the_result_file(words, command, arguments, given_rows, tmp_path, monkeypatch):
-    stated, options = check_command(monkeypatch, given_rows, words, tmp_path)
-    assert stated == f"python -m benchmarks {command}"
-    assert options["device"] == "cpu" and arguments.items() <= options.items()
-
-
-def test_every_command_is_tested():
-    assert {words[0] for words, *_ in COMMANDS} == _COMMANDS.keys()
+@pytest.mark.parametrize("name", _COMMANDS)
+def test_options_reach_the_run_and_the_result_file(name, given_rows, tmp_path, monkeypatch):
+    """All options of a command at once, and those alone that are always stated."""
+    every = _COMMANDS[name][1]
+    for given in (every, [option for option in every if option in ("scene_path", "profile")]):
+        words = [name, *(word for option in given for word in OPTIONS[option][0])]
+        stated, options = check_command(monkeypatch, given_rows, words, tmp_path)
+        plain = [word if word.startswith("-") else Path(word).name for word in words]
+        assert shlex.split(stated) == ["python", "-m", "benchmarks", *plain, *["--device", "cpu"] * (given != every)]
+        assert {option: OPTIONS[option][1] for option in given}.items() <= options.items()
+        left = [option for option in every if option not in given and option != "device"]
+        assert all(options[option] in (None, option in ("rivals", "parts")) for option in left)
 
 
 def test_some_rows_replace_those_alone(given_rows, tmp_path, monkeypatch):

@@ -74,12 +74,10 @@ def test_errors_against_the_float64_path(rows):
     by_name = {(row.method, row.option): row.get("max_error") for row in rows}
     # Radiance up to 2.6 in float32: 1e-6 measured.
     assert 0.0 < by_name["ours", "M"] < 2e-5
-    half = 0.5 / 255.0
-    # Some byte of 50,000 is all but half a level off; tanh, the model's own, adds nothing to that.
-    assert 0.95 * half < by_name["exact", "tanh"] < 1.01 * half
-    assert 0.95 * half < by_name["exact", "erf"] < half + 5e-3
-    # A channel of RGB9E5 errs by up to a 1024th of the brightest one, which is 2.6 times the darkest.
-    assert 1e-4 < by_name["pages", "M"] < 2e-3
+    # A channel of RGB9E5 errs by up to a 1024th of the brightest one, which is 2.6 times the darkest; tanh, the model's
+    # own, adds nothing to that.
+    assert all(1e-4 < by_name[row] < 2e-3 for row in (("exact", "tanh"), ("pages", "M")))
+    assert 1e-4 < by_name["exact", "erf"] < 7e-3
 
 
 @pytest.mark.slow
@@ -92,6 +90,5 @@ def test_frames_have_nothing_to_fit(lightmaps):
 
 def test_texture_and_pages_agree_with_the_decode(rows):
     ours, texture, pages = (next(row for row in rows if row.method == each) for each in ("ours", "texture", "pages"))
-    # 8 bits lose little at such errors.
     assert abs(texture["seen"] - ours["seen"]) < 0.1 and abs(texture["worst_seen"] - ours["worst_seen"]) < 0.1
     assert pages["pages_decoded"] == 3 + 2 + 1 and abs(pages["psnr"] - texture["psnr"]) < 0.1

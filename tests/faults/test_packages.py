@@ -39,7 +39,7 @@ COMMANDS = (
     (
         "astc_encoder",
         "AttributeError",
-        ("compress", CORPUS / "mesh.glb", "a.exr", "--profile", "astc", "-o", "out.wlm"),
+        ("compress", CORPUS / "mesh.glb", CORPUS / "astc.ktx2", "-o", "out.wlm"),
     ),
     ("onnx", "SyntaxError", ("smoke", "export-onnx", FILES / "smoke.wlm", "-o", "out.onnx")),
     ("ray", "OSError", ("compress", SET, "--cluster", "auto", "-o", "out.wlm")),

@@ -13,11 +13,11 @@ import pytest
 import warp as wp
 
 import wlm_kernels
-from benchmarks import smoke_path
+from benchmarks import matrix_tiles, smoke_path
 from wlm_kernels import mlp
 from wlm_kernels.fluid import advection, advection_sources, fire, lattice, lattice_bodies, lattice_fields, lattice_links
 from wlm_kernels.lightmap import decode as lightmap_decode
-from wlm_kernels.lightmap import matrix_decode, matrix_pages, pages
+from wlm_kernels.lightmap import matrix_pages, pages
 from wlm_kernels.lightmap import step as lightmap_step
 from wlm_kernels.probe import decode as probe_decode
 from wlm_kernels.probe import gaussian_sum
@@ -119,9 +119,9 @@ FACTORIES = [
     *_cases("mlp", lambda *of: mlp.kernels(16, *of), [], WIDTHS, ("fast", "exact", "tanh"), (3, 5)),
     *_cases("step", lambda *of: lightmap_step.step_kernels(*of, "cuda"), [], (16, 64), ("tanh", "exact")),
     *_cases("exact_decode", lambda width: [lightmap_decode.exact_kernel(width, "tanh")], [], WIDTHS),
-    *_cases("matrix_decode", matrix_decode.matrix_kernels, [(16, 32)], (16, 48, 64), (4, 32, 128)),
+    *_cases("matrix_tiles", matrix_tiles.matrix_kernels, [], (16, 48, 64), (4, 32, 128)),
     *_cases("pages", lambda *of: [pages.page_kernel(*of)], [], (8, 16, 64), ("fast", "exact")),
-    *_cases("matrix_pages", lambda width: [matrix_pages.page_kernel(width)], [], (16, 48, 64)),
+    *_cases("matrix_pages", lambda width: [matrix_pages.page_kernel(width)], [(16,)], (16, 48, 64)),
     *_cases("gaussian_step", lambda latent: probe_step.step_kernels(latent, "cuda"), [], LATENTS),
     *_cases("gaussian_sum", gaussian_sum.sum_kernels, [], LATENTS),
     *_cases("probe_network", _probe_network, [((9, 64, 27),)], ((9, 64, 27), (1, 8, 3), (12, 48, 12), (12, 128, 75))),

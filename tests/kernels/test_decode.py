@@ -13,7 +13,7 @@ from kernels.stepping import Case, draw, trainer
 from wlm.lightmap.decode import SheetDecoder
 from wlm.lightmap.encodings.maps import MapTiles, split_networks
 from wlm.lightmap.model import SheetModel
-from wlm_kernels.lightmap.matrix_decode import pack_networks
+from wlm_kernels.lightmap.matrix_network import pack_networks
 
 KINDS = (3, 3, 3, 1)
 BETWEEN = 21.7  # between the last stored time and the next day's first

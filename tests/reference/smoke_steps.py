@@ -1,7 +1,7 @@
 """Steps of air and of smoke in float64, as functions of what has gradients, for finite differences.
 
-`Air` continues the flow of `reference.lattice` from stored populations; `Smoke` does what `reference.advection` does
-cell by cell for all cells at once, with sources and buoyancy.
+`Air` continues the flow of `reference.lattice` from stored populations; `Smoke` is advection without any code of the
+kernels, with sources and buoyancy. Its positions are in fine cells.
 """
 
 import itertools
@@ -77,11 +77,12 @@ class Air:
 
 @dataclass
 class Smoke:
-    """Smoke in a domain, see `reference.advection.Domain`.
+    """Smoke in a domain.
 
     Attributes:
         solid: bool [X, Y, Z], coarse cells.
-        refinement, ends: As there.
+        refinement: Fine cells along an edge of a coarse one.
+        ends: For each axis its low and high end: 0 periodic, 1 open, 2 closed.
         dt: Steps of the lattice in a step.
         scheme: "maccormack" or "semi-lagrangian".
         decay: Factors of density and temperature.

@@ -3,7 +3,7 @@
 RGB9E5 takes 32 bits a texel, and all GPUs filter it; half floats take 64, since desktop GPUs support them with four
 channels but not with three. Both block formats take 16 bytes for 4x4 texels, 8 bits per texel.
 (lightmap-uv-clustering-cascade, section 4.4, counts 6 bits per texel for ASTC 4x4; the format takes 8, as we count.)
-ASTC, and decoding of BC6H, need the optional packages of the extra `atlas`.
+Decoding of both needs the optional packages of the extra `atlas`.
 
 Half floats represent the decoded texels of every format exactly.
 """
@@ -19,7 +19,7 @@ from wlm.errors import WlmError
 from wlm.formats import hdr_blocks
 from wlm.formats.exr import HALF_MAX
 from wlm.formats.shared_exponent import LARGEST
-from wlm.ops.bc6h import bc6h_blocks
+from wlm.ops.hdr_blocks import encoded_blocks
 
 BLOCK_CODECS = ("bc6h", "astc")
 _EXTRA = "atlas"
@@ -50,7 +50,7 @@ def quantise(
 
 def stored(samples: torch.Tensor, weight: torch.Tensor | None, colour: str) -> torch.Tensor:
     """Returns the samples of T tiles after encoding and decoding, float32 [T, ny, nx, 3], at least 0; for block formats
-    ny and nx are multiples of 4. BC6H weights their squared errors by `weight` [T, ny, nx], which other formats ignore.
+    ny and nx are multiples of 4, and squared errors are weighted by `weight` [T, ny, nx], which other formats ignore.
     For half floats, whose rounding is too small to matter, samples stay as they are.
     """
     if colour == "half":
@@ -58,11 +58,8 @@ def stored(samples: torch.Tensor, weight: torch.Tensor | None, colour: str) -> t
     if colour == "rgb9e5":
         return _rounded(samples)
     count, ny, nx, _ = samples.shape
-    if colour == "bc6h":
-        _, decoded = bc6h_blocks(_by_block(samples), _by_block(weight[..., None])[..., 0])
-        return _of_blocks(decoded, count, ny, nx)
-    _, decoded = encode(samples.reshape(count * ny, nx, 3), colour, device=str(samples.device))
-    return torch.from_numpy(decoded.reshape(count, ny, nx, 3)).to(samples)
+    _, decoded = encoded_blocks(colour, _by_block(samples), _by_block(weight[..., None])[..., 0])
+    return _of_blocks(decoded, count, ny, nx)
 
 
 def _rounded(samples: torch.Tensor) -> torch.Tensor:
@@ -105,14 +102,11 @@ def encode(
     light = light.clamp(0.0, HALF_MAX).float()
     light = torch.cat([light, light[-1:].expand(below, -1, -1)]) if below else light
     light = torch.cat([light, light[:, -1:].expand(-1, right, -1)], 1) if right else light
-    if codec == "bc6h":
-        weight = torch.ones((height, width), device=device) if weight is None else _on(weight, device)
-        padded = pad(weight.float(), (0, right, 0, below))[None, ..., None]
-        blocks, decoded = bc6h_blocks(_by_block(light[None]), _by_block(padded)[..., 0])
-        whole = _of_blocks(decoded, 1, *light.shape[:2])[0, :height, :width]
-        return blocks.cpu().numpy(), whole.half().cpu().numpy()
-    blocks = np.frombuffer(_astc().encode(light.half().cpu().numpy()), np.uint8).reshape(-1, 16).copy()
-    return blocks, decode(blocks, height, width, codec).astype(np.float16)
+    weight = torch.ones((height, width), device=device) if weight is None else _on(weight, device)
+    padded = pad(weight.float(), (0, right, 0, below))[None, ..., None]
+    blocks, decoded = encoded_blocks(codec, _by_block(light[None]), _by_block(padded)[..., 0])
+    whole = _of_blocks(decoded, 1, *light.shape[:2])[0, :height, :width]
+    return blocks.cpu().numpy(), whole.half().cpu().numpy()
 
 
 def decode(blocks: np.ndarray, height: int, width: int, codec: str) -> np.ndarray:
@@ -124,7 +118,7 @@ def decode(blocks: np.ndarray, height: int, width: int, codec: str) -> np.ndarra
     if codec == "bc6h":
         texels = hdr_blocks.decode_bc6h(blocks.tobytes(), *size, _EXTRA)
     else:
-        texels = _astc().decode(blocks.tobytes(), *size)
+        texels = hdr_blocks.decode_astc(blocks.tobytes(), (BLOCK_SIDE, BLOCK_SIDE), *size, _EXTRA)
     texels = texels[:height, :width].astype(np.float32)
     broken = ~np.isfinite(texels).all(axis=2)
     if broken.any():
@@ -135,7 +129,3 @@ def decode(blocks: np.ndarray, height: int, width: int, codec: str) -> np.ndarra
 
 def _on(values: np.ndarray | torch.Tensor, device: str) -> torch.Tensor:
     return torch.as_tensor(values if isinstance(values, torch.Tensor) else np.array(values), device=device)
-
-
-def _astc() -> hdr_blocks.Astc:
-    return hdr_blocks.astc((BLOCK_SIDE, BLOCK_SIDE), hdr_blocks.ASTC_MEDIUM, _EXTRA)

@@ -37,7 +37,6 @@ from wlm.system import OnProgress
 _CELLS_AT_ONCE = 1 << 24
 _FEWER_VIEWS = 4  # one view of the comparison with a plain lightmap per this number of the profile's views
 _NO_ROOM = "budget: {:g} of the bits of {}x{} texels is less than the smallest tiles and lookup texture take; give more"
-_PACKAGES = {"cascade": "uvunwrap", "astc": "astc_encoder"}  # packages of the extra, by method and colour
 
 
 def compress(
@@ -81,9 +80,8 @@ def compress(
     profile, method = Profile.load(profile).override(settings).checked(len(scene.sheets) * len(scene.states))
     for sheet in scene.sheets:
         check_sides("size", *sheet.mask.shape[::-1])
-    for choice in (method, profile.colour):
-        if choice in _PACKAGES:  # a missing package is reported now, not after minutes
-            need(_PACKAGES[choice], "atlas")
+    if method == "cascade":
+        need("uvunwrap", "atlas")  # if it is missing, this is reported now, not after minutes
     stages = Stages(device, progress, checkpoint)
     stages.place = place
     try:

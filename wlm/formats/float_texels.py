@@ -14,7 +14,7 @@ from typing import BinaryIO
 import numpy as np
 
 from wlm.errors import WlmError
-from wlm.formats.hdr_blocks import ASTC_BLOCKS, ASTC_MEDIUM, astc, decode_bc6h
+from wlm.formats.hdr_blocks import ASTC_BLOCKS, decode_astc, decode_bc6h
 from wlm.formats.limits import PICTURE_BYTES, PICTURE_GROWTH, check_growth, check_sides
 from wlm.formats.shared_exponent import unpack_rgb9e5
 
@@ -169,7 +169,7 @@ def _bc6h(data: memoryview, rows: int, columns: int, *, signed: bool) -> np.ndar
 
 
 def _astc(data: memoryview, rows: int, columns: int, *, block: tuple[int, int]) -> np.ndarray:
-    return astc(block, ASTC_MEDIUM, EXTRA).decode(bytes(data), rows, columns)
+    return decode_astc(bytes(data), block, rows, columns, EXTRA)
 
 
 HALF_RGB = Layout(3, 6, partial(_plain, dtype="<f2"))

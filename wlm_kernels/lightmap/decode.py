@@ -1,6 +1,6 @@
 """Decodes tiles of a lightmap over time from their stored bytes: BC7 blocks, 8-bit planes and a small MLP.
 
-`exact_kernel` evaluates one texel per thread, in the same order of operations as training. `matrix_decode` is faster,
+`exact_kernel` evaluates one texel per thread, in the same order of operations as training. `matrix_network` is faster,
 on a GPU's matrix units.
 
 Read `benchmarks/lightmap_exact.py` first; it has the same decode in NumPy. `features` describes the maps F_uv to F_vt.

@@ -12,7 +12,7 @@ import functools
 import warp as wp
 
 from wlm_kernels.lightmap.frames import StoredFrames
-from wlm_kernels.lightmap.matrix_decode import Maps, map_inputs, matrix_texels
+from wlm_kernels.lightmap.matrix_network import Maps, map_inputs, matrix_texels
 from wlm_kernels.lightmap.pages import (
     BLOCK,
     TAU,
@@ -80,7 +80,7 @@ def _sum_of_group(x: wp.vec4, size: int) -> wp.vec4:
 def page_kernel(hidden: int) -> wp.Kernel:
     """Builds (once) the kernel that decodes squares of texels, for networks of one hidden width, a multiple of 16.
 
-    The two arrays of the networks are those of `matrix_decode.pack_biases` and `pack_networks`. GELU is its tanh form.
+    The two arrays of the networks are those of `matrix_network.pack_biases` and `pack_networks`. GELU is its tanh form.
     """
     evaluate, vec_hidden = matrix_texels(hidden), wp.types.vector(hidden, float)
 

@@ -305,7 +305,7 @@ def curves(tiles: Tiles, sizes: list[Size], stages: Stages) -> np.ndarray:
             columns[size.ny] = [fitted_columns(piece, size.ny) for piece in pieces]
         for piece, own in zip(pieces, columns[size.ny], strict=True):
             samples = solve(piece, size.nx, size.ny, rounds, own).clamp(min=0.0)
-            weight = sample_weights(piece, size.nx, size.ny) if size.format == BLOCKS else None
+            weight = sample_weights(piece, size.nx, size.ny) if size.step > 1 else None
             result.append(errors(piece, colour.stored(samples, weight, size.format)))
         return {"error": torch.cat(result).cpu().numpy()}  # one copy, so that the GPU waits for the CPU once
 

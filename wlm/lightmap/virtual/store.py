@@ -32,7 +32,7 @@ from wlm_kernels.lightmap import frames as frame_kernels
 from wlm_kernels.lightmap import matrix_pages
 from wlm_kernels.lightmap import pages as kernels
 from wlm_kernels.lightmap.features import INPUTS
-from wlm_kernels.lightmap.matrix_decode import pack_biases, pack_networks, packed_words
+from wlm_kernels.lightmap.matrix_network import pack_biases, pack_networks, packed_words
 from wlm_kernels.lightmap.virtual import KEEP
 
 _CHUNK = 64  # tiles that are read at once

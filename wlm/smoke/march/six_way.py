@@ -100,9 +100,9 @@ def bake_coarse(volume: DensityVolume, camera: Camera, march: March = March()) -
 
 
 def coarse_march(volume: DensityVolume, seed: int = 0) -> March:
-    """Returns settings of a march in steps of 1/130 of the smoke's longest edge, but at least of a voxel: finer ones
-    take longer than `bake`. `seed` is that of the jitter."""
-    return March(max(max(volume.shape) / _STEPS, 1.0), seed=seed)
+    """Returns settings of a march in steps of 1/130 of the smoke's longest edge, but at least of a quarter of a voxel,
+    or on a CPU of a voxel: finer ones take longer than `bake` there. `seed` is that of the jitter."""
+    return March(max(max(volume.shape) / _STEPS, 1.0 if volume.device.type == "cpu" else 0.25), seed=seed)
 
 
 def march_planes(volume: DensityVolume, camera: Camera, march: March) -> torch.Tensor:

@@ -111,6 +111,6 @@ def predict(
     smoke = moved(smoke, device)
     march = coarse_march(smoke, seed)
     nodes = math.prod(smoke.shape) / march.step**3
-    if device == "cpu" and camera.height * camera.width * max(smoke.shape) < _PER_NODE * nodes:
+    if device == "cpu" and camera.height * camera.width * max(smoke.shape) <= _PER_NODE * nodes:
         return bake(smoke, camera, step=_STEP, estimate=False)
     return bake_coarse(smoke, camera, march)

@@ -1,4 +1,4 @@
-// The body of the function `map_inputs` of wlm_kernels/lightmap/matrix_decode.py, behind `matrix_maps.cuh`.
+// The body of the function `map_inputs` of wlm_kernels/lightmap/matrix_network.py, behind `matrix_maps.cuh`.
 
 const bool wraps = stored.periodic != 0;
 wp::vec_t<12, float> result;

@@ -6,7 +6,7 @@
 //
 // Part of the bodies of native functions, behind `matrix_units.cuh`. A function defines:
 //   H          hidden width, a multiple of 16
-// The weights are those of `pack_networks` in wlm_kernels/lightmap/matrix_decode.py.
+// The weights are those of `pack_networks` in wlm_kernels/lightmap/matrix_network.py.
 
 constexpr int NT = H / 8, KT = H / 16;  // columns of 8 units, and steps of 16, in a layer
 constexpr int W1 = NT * 64, W2 = KT * NT * 64, W3 = 2 * KT * 64, B2 = H / 2, WORDS = W1 + W2 + W3 + B2 + 4;

@@ -1,7 +1,7 @@
 // Evaluates the networks of any 32 texels: each lane of a warp brings a texel and the number of its tile, and the warp
 // evaluates the network of one tile after another for all lanes. Neighbouring texels are mostly of one tile.
 //
-// The body of the function `evaluate` of `matrix_texels` in wlm_kernels/lightmap/matrix_decode.py, behind
+// The body of the function `evaluate` of `matrix_texels` in wlm_kernels/lightmap/matrix_network.py, behind
 // `matrix_network.cuh`. All lanes of a warp must call it, in blocks of 128 threads; a lane without a texel has n < 0.
 
 __shared__ uint4 staged[2][128];

@@ -1,7 +1,7 @@
 // Evaluates the network of a tile for four rows of texels: a thread brings the features of a column's four texels, and a
 // warp evaluates the network of its 32 columns together.
 //
-// The body of the function `forward` of wlm_kernels/lightmap/matrix_decode.py, behind `matrix_network.cuh` and
+// The body of the function `forward` of benchmarks/matrix_tiles.py, behind `matrix_network.cuh` and
 // `matrix_maps.cuh`. The function defines its arguments, and:
 //   R          size of F_uvt along u and v
 //   ROWS       rows of texels in a strip, a multiple of 4; a block of 128 threads decodes one strip of a tile

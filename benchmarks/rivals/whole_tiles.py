@@ -1,15 +1,13 @@
-"""Decodes whole tiles to RGB9E5 at run time: all data stays on the device, and a decode only launches kernels.
+"""Decodes whole tiles to RGB9E5: all data stays on the device, and a decode only launches kernels.
 
-`wlm.lightmap.Decoder` returns arrays on the host; the decoders of this module are for a renderer's loop. Each decodes
-the tiles of one kind of one sheet, without filling gaps between charts: an `ExactDecoder`, on CUDA a `MatrixDecoder`,
-and a `FrameDecoder`. `wlm.lightmap.VirtualTexture` fills gaps, adds light groups and has mips.
+Each decoder decodes the tiles of one kind of one sheet, without filling gaps between charts: an `ExactDecoder`, on CUDA
+a `MatrixDecoder`, and a `FrameDecoder`.
 """
-
-from __future__ import annotations
 
 import numpy as np
 import warp as wp
 
+from benchmarks.matrix_tiles import matrix_kernels
 from wlm.errors import WlmError
 from wlm.formats.shared_exponent import unpack_rgb9e5
 from wlm.lightmap.decode import device_of, gelu_of
@@ -18,11 +16,35 @@ from wlm.lightmap.encodings.maps import MapTiles, split_networks
 from wlm.lightmap.model import SheetModel
 from wlm.lightmap.tiles import TILE
 from wlm_kernels.lightmap import decode as decode_kernels
-from wlm_kernels.lightmap import matrix_decode
-from wlm_kernels.shared_exponent import pack_mean
+from wlm_kernels.lightmap.matrix_network import pack_networks
+from wlm_kernels.shared_exponent import pack_rgb9e5
+
+wp.set_module_options({"enable_backward": False})
 
 
-class RuntimeDecoder:
+@wp.kernel
+def _mix_kernel(
+    # in:
+    early: wp.array3d[wp.vec3],
+    late: wp.array3d[wp.vec3],
+    share: float,
+    # out:
+    out: wp.array3d[wp.uint32],
+):
+    i, y, x = wp.tid()
+    light = early[i, y, x]
+    if share > 0.0:
+        light = (1.0 - share) * light + share * late[i, y, x]
+    out[i, y, x] = pack_rgb9e5(light)
+
+
+def _mix(early: wp.array, late: wp.array, share: float, out: wp.array) -> None:
+    """Interpolates linear radiance between two times, vec3 [n, h, w] each, and packs it into `out`, uint32 [n, h, w].
+    `share` is the weight of the later time, 0 to 1."""
+    wp.launch(_mix_kernel, out.shape, inputs=[early, late, share], outputs=[out], device=out.device)
+
+
+class TileDecoder:
     """Base class: decodes all tiles of one kind on a device at a time that `set_time` chooses.
 
     `decode` writes `out`, `wp.array` uint32 [n, 128, 128], in the order of the tiles' `numbers`: linear radiance as
@@ -59,7 +81,7 @@ class RuntimeDecoder:
         return unpack_rgb9e5(self.out.numpy())
 
 
-class _MapDecoder(RuntimeDecoder):
+class _MapDecoder(TileDecoder):
     """Base class of the decoders of dynamic tiles."""
 
     def __init__(self, model: SheetModel, device: str = "cpu", gelu: str | None = None) -> None:
@@ -91,8 +113,8 @@ class MatrixDecoder(_MapDecoder):
         if profile.hidden % 16:
             raise WlmError(f"model: expected networks whose hidden width is a multiple of 16, got {profile.hidden}")
         super().__init__(model, name, "fast")
-        self._kernels = matrix_decode.matrix_kernels(profile.hidden, profile.uvt_resolution)
-        packed = matrix_decode.pack_networks(*split_networks(model.net.astype(np.float32), profile.hidden))
+        self._kernels = matrix_kernels(profile.hidden, profile.uvt_resolution)
+        packed = pack_networks(*split_networks(model.net.astype(np.float32), profile.hidden))
         self._packed = wp.array(packed, dtype=wp.uint32, device=self.device)
 
     def decode(self) -> None:
@@ -110,10 +132,10 @@ class ExactDecoder(_MapDecoder):
     def decode(self) -> None:
         for i in range(len(self._reads)):
             self._tiles.launch(self._states[i], self._rows, self._light[i])
-        pack_mean(*self._light, self._share, self.out)
+        _mix(*self._light, self._share, self.out)
 
 
-class FrameDecoder(RuntimeDecoder):
+class FrameDecoder(TileDecoder):
     """Decoder of tiles that are stored as frames: one thread reads one texel of one frame, or of two to interpolate."""
 
     def __init__(self, model: SheetModel, device: str = "cpu") -> None:
@@ -128,7 +150,7 @@ class FrameDecoder(RuntimeDecoder):
 
     def decode(self) -> None:
         self._tiles.decode(self._time, self._rows, self._light)
-        pack_mean(self._light, self._light, 0.0, self.out)
+        _mix(self._light, self._light, 0.0, self.out)
 
 
 def fast_decoder(model: SheetModel, device: str = "cpu") -> ExactDecoder | MatrixDecoder:
