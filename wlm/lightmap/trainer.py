@@ -512,12 +512,12 @@ class Fitter:
         chunk, frozen, steps = _CHUNK["cpu" if self._device == "cpu" else "cuda"], trainer.frozen, trainer.steps
         step, end = trainer.step, time.monotonic() + seconds
         while step < steps:
-            count = min(chunk, (frozen if step < frozen else steps) - step)
+            count = min(chunk, steps - step)
             trainer.run(count)
             step += count
             if time.monotonic() >= end:
                 break
-            if self._track and step == frozen < steps:
+            if self._track and step - count < frozen <= step < steps:
                 trainer.psnr()  # samples before the maps were frozen do not count
         figures = {"loss": float(trainer.losses().mean()), "PSNR_dB": trainer.psnr()} if self._track else {}
         if step < steps:
