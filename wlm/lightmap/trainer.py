@@ -33,23 +33,13 @@ _CHUNK = {"cpu": 5, "cuda": 200}  # steps between two looks at the clock
 _REPEATS = 50  # steps in one CUDA graph, so that the GPU does not wait for the host between them
 
 
-def _z_order() -> np.ndarray:
-    """Returns the place of each texel, int [128, 128], on a curve that fills one block of 4 x 4 texels after another
-    (Z-order). The blocks are half a block off those of F_uv: most are cells of F_uvt."""
-    y, x = np.ogrid[2 : TILE + 2, 2 : TILE + 2]
-    return sum(((y >> bit & 1) << 2 * bit + 1) + ((x >> bit & 1) << 2 * bit) for bit in range(8))
-
-
-_Z = _z_order()
-
-
 class Targets:
     """The training data of N tiles, on the host.
 
     Attributes:
         number: int [N], numbers of the tiles in their grid.
         colour: float32 [N, T, 128 * 128, 3], (colour / scale - shift) / spread of the valid texels; 0 elsewhere.
-        texels: int32 [N, K], flat indices of valid texels in the order of `_Z`, padded to the largest count K.
+        texels: int32 [N, K], flat indices of valid texels, padded to the largest count K.
         count: int32 [N], number of valid texels.
         weight, emphasis: Loss weights, float32 [N, T, 3], and a number, see `wlm_kernels.lightmap.features.Batch`.
         shift, spread: float32 [N, 3], mean and standard deviation of colour / scale.
@@ -85,9 +75,7 @@ class Targets:
 
         def fill(i: int) -> None:
             rows, columns = np.nonzero(tiles.mask[i])
-            order = np.argsort(_Z[rows, columns])
-            at = rows * TILE + columns
-            self.texels[i, : self.count[i]] = at[order]
+            at = self.texels[i, : self.count[i]] = rows * TILE + columns
             values = tiles.light[i][:, tiles.mask[i]]  # [T, K, 3], a copy
             if gamma != 1.0:
                 np.power(values, np.float32(1.0 / gamma), out=values)

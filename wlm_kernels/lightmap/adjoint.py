@@ -26,10 +26,22 @@ def corner_weights(first: int, second: int, f: float, block: int) -> wp.vec2:
     return wp.vec2(a, b)
 
 
+_Spread = wp.types.vector(8, float)
+
+# The lanes of a warp share their additions, so that neighbours in memory are added at once: 8 lanes add the endpoints
+# of one sample's block, then of another sample's. If each lane added its own sample, there would be one request to
+# memory for each number, rather than one for four.
+
+
+@wp.func_native(native_source(__package__, "spread_texels"))
+def _spread_texels(g: wp.vec4) -> _Spread:
+    """Redistributes g over a warp: component r of lane l's result is component l % 4 of g in lane 4 r + l / 8."""
+
+
 @wp.func_native(native_source(__package__, "add_endpoints"))
-def _add_endpoints(acc: wp.array2d[wp.int64], lane: int, at: int, a: float, b: float, g: wp.vec4):
-    """Adds a * g to the sums with the indices `at` to `at` + 3, and b * g to the next four; nothing if `at` < 0, where
-    a and b must be 0. All lanes of a warp must call it together."""
+def _add_endpoints(acc: wp.array2d[wp.int64], lane: int, at: int, a: float, b: float, g: _Spread):
+    """Adds a * g to the sums with the indices `at` to `at` + 3, and b * g to the next four; nothing if `at` < 0. All
+    lanes of a warp must call it together; their g comes from `_spread_texels`."""
 
 
 @wp.func_native(native_source(__package__, "add_cells"))
@@ -38,10 +50,15 @@ def _add_cells(acc: wp.array2d[wp.int64], early: wp.vec2i, late: wp.vec2i, ft: f
     indices `early`, times ft at `late`. All lanes of a warp must call it together."""
 
 
+@wp.func
+def _spread_none(g: wp.vec4) -> wp.vec4:
+    return g
+
+
 @functools.cache
 def _adders(device_kind: str) -> tuple[Any, ...]:
-    """Returns a function that adds a number, the type of the sums, and a function that adds the gradient g to a block's
-    two endpoints."""
+    """Returns a function that adds a number, the type of the sums, a function that adds the gradient g to a block's two
+    endpoints, and a function that prepares g for it."""
     if device_kind == "cuda":
         # Fixed point with steps of 2^-40, about 1e-12; a sum beyond 8e6 would overflow.
 
@@ -49,7 +66,7 @@ def _adders(device_kind: str) -> tuple[Any, ...]:
         def add(acc: wp.array2d[wp.int64], lane: int, i: int, value: float):
             wp.atomic_add(acc, lane, i, wp.int64(value * 1099511627776.0))
 
-        return add, wp.int64, _add_endpoints
+        return add, wp.int64, _add_endpoints, _spread_texels
 
     @wp.func
     def add(acc: wp.array2d[float], lane: int, i: int, value: float):
@@ -62,14 +79,14 @@ def _adders(device_kind: str) -> tuple[Any, ...]:
                 add(acc, lane, at + c, a * g[c])
                 add(acc, lane, at + 4 + c, b * g[c])
 
-    return add, float, add_endpoints
+    return add, float, add_endpoints, _spread_none
 
 
 @functools.cache
 def scatters(device_kind: str) -> tuple[Any, Any, Any, Any]:
     """Builds (once) for "cpu" or "cuda" the functions that add a sample's gradients to the gradient sums of the feature
     maps. Returns a `wp.func` for F_uv, one for F_uvt, one for the planes F_ut and F_vt, and the type of the sums."""
-    add, scalar, add_endpoints = _adders(device_kind)
+    add, scalar, add_endpoints, spread = _adders(device_kind)
 
     @wp.func
     def scatter_texel(
@@ -90,7 +107,7 @@ def scatters(device_kind: str) -> tuple[Any, Any, Any, Any]:
         w = ste_weight(maps.uv_weights[n, y, x], quantised)
         add(acc, lane, offsets.uv_weights + (n * height + y) * width + x, wp.dot(e1 - e0, g))
         block = (n * (height // 4) + y // 4) * (width // 4) + x // 4
-        add_endpoints(acc, lane, offsets.uv_endpoints + block * 8, 1.0 - w, w, g)
+        add_endpoints(acc, lane, offsets.uv_endpoints + block * 8, 1.0 - w, w, spread(g))
 
     @wp.func
     def scatter_volume(
@@ -119,6 +136,7 @@ def scatters(device_kind: str) -> tuple[Any, Any, Any, Any]:
         xb = axis_index(x + 1, width, 0)
         ya = axis_index(y, height, 0)
         yb = axis_index(y + 1, height, 0)
+        parts = spread(g)
         two = int(2)  # rolled, as in volume_at
         four = int(4)
         for k in range(two):
@@ -148,7 +166,7 @@ def scatters(device_kind: str) -> tuple[Any, Any, Any, Any]:
                                 second += c * w
                                 add(acc, lane, offsets.uvt_weights + (s * height + yy) * width + xx, c * along)
                         at = offsets.uvt_endpoints + ((s * (height // 4) + by) * (width // 4) + bx) * 8
-                    add_endpoints(acc, lane, at, first, second, g)
+                    add_endpoints(acc, lane, at, first, second, parts)
 
     if device_kind == "cuda":
 

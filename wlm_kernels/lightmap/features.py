@@ -114,7 +114,7 @@ class Batch:
     """Training data of N tiles at T stored times; K is the largest number of valid texels of a tile."""
 
     targets: wp.array3d[wp.vec3]  # [N, T, 128 * 128] normalised gamma-space colour
-    texels: wp.array2d[int]  # [N, K] flat indices of valid texels, neighbours near each other, padded
+    texels: wp.array2d[int]  # [N, K] flat indices of valid texels, padded
     texel_count: wp.array1d[int]  # [N]
     tau: wp.array1d[float]  # [T] place of each time on the features' time axis, in [0, 1]
     encoding: wp.array1d[wp.vec4]  # [T] gamma(t) of eq. 4
@@ -139,6 +139,11 @@ class Batch:
 
 
 @wp.func
+def draw_state(batch: Batch, n: int, b: int, samples: int) -> wp.uint32:
+    return wp.rand_init(batch.seed + batch.number[n] * 9973, batch.control[0] * samples + b)
+
+
+@wp.func
 def write_rates(batch: Batch):
     """Writes the rates of this step: the launch that uses them also counts the step and can't read its number."""
     now = batch.schedule[wp.min(batch.control[0], batch.schedule.shape[0] - 1)]
@@ -159,20 +164,11 @@ class Sample:
 
 @wp.func
 def draw_sample(batch: Batch, n: int, b: int, samples: int) -> Sample:
-    """Draws random sample b of tile n for this step: a valid texel and a stored time.
-
-    The texels of a step are spread evenly over the tile: the list of valid texels is cut into as many equal parts as
-    there are samples. This gives less noise than independent draws, and neighbours can share their work: samples 4 i to
-    4 i + 3 have one time, so that a GPU adds most of their gradients at once.
-    """
-    seed = batch.seed + batch.number[n] * 9973
-    group = wp.rand_init(seed + 1, batch.control[0] * (samples // 4) + b // 4)
-    state = wp.rand_init(seed, batch.control[0] * samples + b)
-    count = batch.texel_count[n]
-    place = int((float(b) + wp.randf(state)) * (float(count) / float(samples)))
+    """Draws random sample b of tile n for this step: a valid texel and a stored time."""
+    state = draw_state(batch, n, b, samples)
     s = Sample()
-    s.flat = batch.texels[n, wp.min(place, count - 1)]
-    s.k = wp.randi(group, 0, batch.tau.shape[0])
+    s.flat = batch.texels[n, wp.randi(state, 0, batch.texel_count[n])]
+    s.k = wp.randi(state, 0, batch.tau.shape[0])
     s.state = state
     return s
 
