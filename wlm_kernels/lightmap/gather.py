@@ -61,35 +61,21 @@ class AdamOfFours:
 
 
 @wp.func
-def _moved(
-    value: float,
-    grad: float,
-    first: float,
-    second: float,
-    decay: wp.vec2,
-    epsilon: float,
-    rate: float,
-    corrections: wp.vec2,
-) -> wp.vec3:
-    """Returns a parameter after Adam's step t and its two moments. `corrections` are 1 / (1 - decay[0]^t) and
+def _moved(state: wp.vec3, grad: float, decay: wp.vec2, epsilon: float, rate: float, corrections: wp.vec2) -> wp.vec3:
+    """Returns a parameter and its two moments after Adam's step t. `corrections` are 1 / (1 - decay[0]^t) and
     1 / sqrt(1 - decay[1]^t), since the moments began at 0."""
-    m = decay[0] * first + (1.0 - decay[0]) * grad
-    v = decay[1] * second + (1.0 - decay[1]) * grad * grad
-    return wp.vec3(value - rate * corrections[0] * m / (wp.sqrt(v) * corrections[1] + epsilon), m, v)
+    m = decay[0] * state[1] + (1.0 - decay[0]) * grad
+    v = decay[1] * state[2] + (1.0 - decay[1]) * grad * grad
+    return wp.vec3(state[0] - rate * corrections[0] * m / (wp.sqrt(v) * corrections[1] + epsilon), m, v)
 
 
 @wp.func
 def _move(values: wp.array1d[float], adam: Adam, i: int, grad: float, rate: float, corrections: wp.vec2):
-    new = _moved(values[i], grad, adam.first[i], adam.second[i], adam.decay, adam.epsilon, rate, corrections)
+    old = wp.vec3(values[i], adam.first[i], adam.second[i])
+    new = _moved(old, grad, adam.decay, adam.epsilon, rate, corrections)
     values[i] = new[0]
     adam.first[i] = new[1]
     adam.second[i] = new[2]
-
-
-@wp.func
-def toward(mean: float, value: float) -> float:
-    """Returns a running mean over about 50 steps, updated with a new value."""
-    return mean + (value - mean) * 0.02
 
 
 @wp.kernel
@@ -130,7 +116,8 @@ def _update(
         return
     t -= output.shape[0]
     if t < mean_loss.shape[0]:
-        mean_loss[t] = toward(mean_loss[t], _drain(loss, t, clear))
+        # A running mean over about 50 steps.
+        mean_loss[t] += (_drain(loss, t, clear) - mean_loss[t]) * 0.02
         return
     t -= mean_loss.shape[0]
     # All reads come before the first write, for which they would wait.
@@ -139,8 +126,8 @@ def _update(
     second = four_at(adam.second, t)
     grad = _drain_four(acc, t)
     for c in range(4):
-        v = wp.clamp(value[c], 0.0, 1.0)
-        new = _moved(v, grad[c], first[c], second[c], adam.decay, adam.epsilon, rates[0], corrections)
+        old = wp.vec3(wp.clamp(value[c], 0.0, 1.0), first[c], second[c])
+        new = _moved(old, grad[c], adam.decay, adam.epsilon, rates[0], corrections)
         value[c] = new[0]
         first[c] = new[1]
         second[c] = new[2]
@@ -187,18 +174,14 @@ def update(
     """Converts sums into gradients, updates the parameters with Adam, and counts the step.
 
     Args:
-        rates: float [4]: the learning rates of maps and networks at this step and Adam's two corrections, see
-            `features.write_rates`.
-        offsets: Positions of the maps in `maps`.
+        rates, offsets: As `features.write_rates` writes them, and the positions of the maps in `maps`.
         acc: The sums for the M parameters of the maps, as `StepKernels.launch` adds them, in fours [lanes, M / 4];
             set to 0.
         maps: vec4 [M / 4], the maps; clamped to [0, 1], then updated.
         partial, partial_out, loss: Sums of P threads or blocks for hidden and output layers and losses, float [P, ...];
             set to 0 on the CPU, whose next step adds to them.
-        adam, adam_hidden, adam_out: States of the optimisers, updated.
-        hidden, output: float, the hidden and output layers, updated.
-        mean_loss: float [N], running mean of each tile's loss, updated.
-        control: int [1], number of the step; increased by 1.
+        adam, adam_hidden, adam_out, hidden, output: States of the optimisers and the layers, float, updated.
+        mean_loss, control: float [N], running mean of each tile's loss; int [1], number of the step, increased by 1.
         rounded: vec4, with `levels` written: the new endpoints and weights on the levels of the file, at their places.
         frozen: Whether only the networks are updated.
         levels: Whether `rounded` is written.
