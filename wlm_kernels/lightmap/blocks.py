@@ -108,7 +108,7 @@ def ste_mix(e0: wp.vec4, e1: wp.vec4, w: float, quantised: int) -> wp.vec4:
 def texel(
     endpoints: wp.array4d[wp.vec4], weights: wp.array3d[float], s: int, y: int, x: int, quantised: int
 ) -> wp.vec4:
-    """Returns the texel (y, x) of slice s of a map in training, from its endpoints and weights."""
+    """Returns the texel (y, x) of slice s of a map in training, from its endpoints (see `wide`) and weights."""
     e0 = ste_endpoint(endpoint_at(endpoints, s, y // 4, x // 4, 0), quantised)
     e1 = ste_endpoint(endpoint_at(endpoints, s, y // 4, x // 4, 1), quantised)
     return ste_mix(e0, e1, ste_weight(weights[s, y, x], quantised), quantised)
@@ -152,7 +152,10 @@ def _reconstruct(
     out: wp.array3d[wp.vec4],
 ):
     s, y, x = wp.tid()
-    out[s, y, x] = texel(endpoints, weights, s, y, x, quantised)
+    # Not `texel`: a caller's tensor may begin anywhere in memory.
+    e0 = ste_endpoint(endpoints[s, y // 4, x // 4, 0], quantised)
+    e1 = ste_endpoint(endpoints[s, y // 4, x // 4, 1], quantised)
+    out[s, y, x] = ste_mix(e0, e1, ste_weight(weights[s, y, x], quantised), quantised)
 
 
 @wp.kernel
