@@ -81,7 +81,7 @@ def _atlas(pattern: str) -> Curve:
 
 
 def _sweep(setting: str) -> Curve:
-    scene = "mean over 4 lightmaps, ablation of cascade"
+    scene = "mean over 18 lightmaps, ablation of cascade"
     return Curve("nvidia-h200", "atlas", scene, f"(ablation whole|sweep {setting} .*)")
 
 
@@ -114,7 +114,7 @@ PLOTS: dict[str, Lines] = {
         },
     ),
     "bench-atlas-sweep.png": Lines(
-        "sizes of the cascade (the paper's figure 7), mean over 4 lightmaps by day",
+        "sizes of the cascade (the paper's figure 7), mean over 18 lightmaps",
         "bpp",
         {
             "ε from 0.3 to 0.7": _sweep("scale"),

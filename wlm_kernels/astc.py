@@ -11,7 +11,8 @@ import warp as wp
 
 from wlm_kernels import block_lines as lines
 
-wp.set_module_options({"enable_backward": False, "max_unroll": 1})
+# Without fused operations every device writes the same bytes.
+wp.set_module_options({"enable_backward": False, "max_unroll": 1, "fuse_fp": False})
 
 _AXIS_ROUNDS = wp.constant(5)
 _REFITTED = wp.constant(2)  # number of refits of the best block's ends to its weights
@@ -82,10 +83,7 @@ def _light_of(place: int) -> float:
         bits = 3 * part
     elif part >= 1536:
         bits = 5 * part - 2048
-    bits = wp.min(((place >> 11) << 10) + (bits >> 3), 0x7BFF)
-    if bits < 1024:
-        return float(bits) / 16777216.0
-    return wp.cast((bits + (112 << 10)) << 13, float)
+    return lines.light_of(wp.min(((place >> 11) << 10) + (bits >> 3), 0x7BFF))
 
 
 @wp.func

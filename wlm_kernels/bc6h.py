@@ -14,11 +14,12 @@ import warp as wp
 
 from wlm_kernels import block_lines as lines
 
-wp.set_module_options({"enable_backward": False, "max_unroll": 1})
+# Without fused operations every device writes the same bytes.
+wp.set_module_options({"enable_backward": False, "max_unroll": 1, "fuse_fp": False})
 
 _POWER_ROUNDS = wp.constant(4)
 _AXIS_ROUNDS = wp.constant(8)
-_REFINED = wp.constant(2)  # number of fits of a line to its texels' lines.nearest indices
+_REFINED = wp.constant(2)  # number of fits of a line to its texels' nearest indices
 _REFITTED = wp.constant(2)  # number of refits of a block's endpoints to its indices
 _TRIED = wp.constant(2)  # number of partitions tried that are encoded
 
@@ -27,14 +28,22 @@ _Codes = wp.types.matrix(shape=(4, 3), dtype=int)
 
 @wp.struct
 class Tables:
-    """The tables of the format, described in `wlm.formats.bc6h`: `MODES`, int [14, 7]; `LAYOUT`, int [14, 82]; `MASKS`,
-    int [32]; `SECOND_ANCHORS`, int [32]; and the value of each half float by its bit pattern, float [31,744]."""
+    """The tables of `wlm.formats.bc6h.TABLES`, int.
+
+    Attributes:
+        modes: [14, 7], a mode's number, its number of bits, whether x, y and z are differences, bits of w, and bits of
+            the others' red, green and blue.
+        layout: [14, 82], for each mode the meaning of each bit of a block: 16 times the number of the field, plus the
+            bit in it; -1 for bits of the mode's number and of indices. Field 4 c + e is channel c of endpoint e (w, x,
+            y, z), field 12 the partition.
+        masks: [32], the texels on the second line of each partition, one bit per texel.
+        anchors: [32], the anchor texel of the second line.
+    """
 
     modes: wp.array2d[int]
     layout: wp.array2d[int]
     masks: wp.array1d[int]
     anchors: wp.array1d[int]
-    halves: wp.array1d[float]
 
 
 @wp.struct
@@ -84,7 +93,7 @@ def _whole(code: int, bits: int) -> int:
 
 @wp.func
 def _coded(place: float, bits: int) -> int:
-    """Returns the code of `bits` bits that expands to the 16-bit value lines.nearest to `place`."""
+    """Returns the code of `bits` bits that expands to the 16-bit value nearest to `place`."""
     top = (1 << bits) - 1
     if bits == 16:
         return wp.clamp(int(place + 0.5), 0, top)
@@ -148,7 +157,7 @@ def _encoded(texels: lines.Texels, tables: Tables, ends: lines.Ends, mode: int, 
             for k in range(steps + 1):
                 share = _share(k, steps)
                 mixed = ((64 - share) * low + share * high + 32) >> 6
-                palette[8 * line + k, c] = tables.halves[(mixed * 31) >> 6]
+                palette[8 * line + k, c] = lines.light_of((mixed * 31) >> 6)
     error = float(0.0)
     for i in range(lines.TEXELS):
         start = int(0)

@@ -55,6 +55,14 @@ class Sums:
 
 
 @wp.func
+def light_of(bits: int) -> float:
+    """Returns the value of a half float, 0 or more and finite, by its bits."""
+    if bits < 1024:
+        return float(bits) / 16777216.0
+    return wp.cast((bits + (112 << 10)) << 13, float)
+
+
+@wp.func
 def in_mask(mask: int, texel: int) -> bool:
     return ((mask >> texel) & 1) == 1
 

@@ -15,7 +15,6 @@ from wlm.lightmap.encodings.frames import FrameTiles
 from wlm.lightmap.encodings.maps import MapTiles, split_networks
 from wlm.lightmap.model import SheetModel
 from wlm.lightmap.tiles import TILE
-from wlm_kernels.lightmap import decode as decode_kernels
 from wlm_kernels.lightmap.matrix_network import pack_networks
 from wlm_kernels.shared_exponent import pack_rgb9e5
 
@@ -89,13 +88,11 @@ class _MapDecoder(TileDecoder):
         variant to use instead of the model's, see `wlm_kernels.mlp`."""
         device = device_of(device)
         self._tiles = MapTiles(model, device, gelu_of(model, gelu))
-        self._states: list[decode_kernels.TimeState | None] = [None, None]
         super().__init__(model, self._tiles, device)
 
     def set_time(self, time: float) -> None:
         self._reads = self.model.axis.reads(time)
-        for i, (stamp, _) in enumerate(self._reads):
-            self._states[i] = self._tiles.state(stamp, self._states[i])
+        self._states = [self._tiles.state(stamp) for stamp, _ in self._reads]
         self._share = self._reads[1][1] if len(self._reads) == 2 else 0.0
 
 
@@ -118,8 +115,8 @@ class MatrixDecoder(_MapDecoder):
         self._packed = wp.array(packed, dtype=wp.uint32, device=self.device)
 
     def decode(self) -> None:
-        (stored, hidden, _), states = self._tiles.arguments, self._states[: len(self._reads)]
-        self._kernels.decode(stored, self._packed, hidden, states, self._share, self._rows, self.out)
+        stored, hidden, _ = self._tiles.arguments
+        self._kernels.decode(stored, self._packed, hidden, self._states, self._share, self._rows, self.out)
 
 
 class ExactDecoder(_MapDecoder):
@@ -130,8 +127,8 @@ class ExactDecoder(_MapDecoder):
         self._light = self._empty(wp.vec3), self._empty(wp.vec3)
 
     def decode(self) -> None:
-        for i in range(len(self._reads)):
-            self._tiles.launch(self._states[i], self._rows, self._light[i])
+        for state, light in zip(self._states, self._light, strict=False):
+            self._tiles.launch(state, self._rows, light)
         _mix(*self._light, self._share, self.out)
 
 

@@ -49,6 +49,7 @@ def test_the_encoder_says_what_its_blocks_hold_and_is_better_than_another(codec,
     light = _pictures()
     blocks, decoded = (part.cpu().numpy() for part in encoded_blocks(codec, torch.from_numpy(light).to(device)))
     np.testing.assert_array_equal(_other(codec, blocks).astype(np.float32), decoded)
+    np.testing.assert_array_equal(blocks, encoded_blocks(codec, torch.from_numpy(light))[0])  # those of the CPU
     kinds = blocks[:, 0] & 31 if codec == "bc6h" else blocks[:, :2].copy().view(np.uint16)[:, 0] & 0x1FFF
     assert len(set(kinds.tolist())) >= {"bc6h": 15, "astc": 8}[codec]  # most modes
 

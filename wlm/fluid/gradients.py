@@ -180,8 +180,7 @@ class DifferentiableLattice:
 
     def _flow(self, forces: wp.array) -> lattice_adjoint.Flow:
         setup, flow = self._setup, lattice_adjoint.Flow()
-        flow.n, flow.bounded = wp.vec3i(*setup.shape), setup.bounded
-        flow.walled = wp.vec3i(*(int(wall) for wall in setup.spec.walls))
+        flow.n, flow.bounded, flow.walled = setup.layout.n, setup.layout.bounded, setup.layout.walled
         flow.tau, flow.eddy, flow.axes = setup.tau, setup.eddy, 2 if setup.spec.lattice == "D2Q9" else 3
         flow.solid, flow.forces = setup.solid, forces
         return flow
@@ -190,7 +189,8 @@ class DifferentiableLattice:
         setup = self._setup
         spec = replace(setup.spec, forced=forces.shape[0] > 0)
         work.done.fill_(done)
-        inputs = [0, wp.vec3i(*setup.shape), f, setup.solid, setup.tau, setup.eddy, forces, 0]
+        # Another array receives the populations, in the same layout.
+        inputs = [0, setup.layout.n, f, setup.solid, setup.tau, setup.eddy, forces, 0, 0]
         outputs = [work.clock, work.trouble, work.sums, out]
         wp.launch(step_kernel(spec), self._cells, inputs=inputs, outputs=outputs, device=f.device)
 
@@ -206,7 +206,7 @@ class DifferentiableLattice:
         left = self._populations(out)
         self._collide(work, self._populations(f), done, forces, left)
         slab, links = Slab(left.device, 0, setup.shape[0]), work.links
-        where = [setup.tables, slab, 0, links.cell.shape[0], wp.vec3i(*setup.shape), setup.bounded, links, setup.solid]
+        where = [setup.tables, slab, 0, links.cell.shape[0], setup.layout, links, setup.solid]
         rise = 1.0 / max(setup.ramp, 1)
         for writing in (False, True):
             lattice_links.apply(setup.link_kernels, *where, work.clock, rise, left, work.sums, writing=writing)
@@ -245,7 +245,7 @@ class DifferentiableLattice:
 
     def _read(self, f: torch.Tensor, forces: wp.array, drho: wp.array, u: wp.array) -> None:
         setup = self._setup
-        inputs = [0, wp.vec3i(*setup.shape), self._populations(f), setup.solid, setup.bodies, forces]
+        inputs = [0, setup.layout, self._populations(f), setup.solid, setup.bodies, forces]
         wp.launch(setup.fluid_kernels.fields, self._cells, inputs=inputs, outputs=[drho, u], device=u.device)
 
 
@@ -597,8 +597,7 @@ class _Force(torch.autograd.Function):
         ctx.air, ctx.body, ctx.like = air, body, f.new_empty(0)
         total = torch.zeros(BODIES, 3, dtype=torch.float64, device=air.device)
         with on_stream(air.device):
-            n = wp.vec3i(*setup.shape)
-            inputs = [setup.tables, n, setup.bounded, setup.links, setup.solid, air._populations(f)]
+            inputs = [setup.tables, setup.layout, setup.links, setup.solid, air._populations(f)]
             size, kernel, into = setup.links.cell.shape[0], setup.link_kernels.force, to_warp(total, wp.vec3d)
             wp.launch(kernel, size, inputs=inputs, outputs=[into], device=into.device)
         return total[body].float()

@@ -5,7 +5,7 @@ Lengths are in cells, times in steps, and the density of air at rest is 1; `Doma
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -24,7 +24,7 @@ from wlm_kernels.fluid.fire import expand_kernel
 from wlm_kernels.fluid.lattice import QUIET, Spec, eddy_factor, step_kernel, trouble_of
 from wlm_kernels.fluid.lattice_fields import FluidKernels, fluid_kernels
 from wlm_kernels.fluid.lattice_links import BOUNCE, INLET, OUTLET, PRESSURE, SLIP, WIND
-from wlm_kernels.fluid.lattice_sets import NARROW, STORAGES, Slab, Tables, tables
+from wlm_kernels.fluid.lattice_sets import NARROW, STORAGES, Layout, Slab, Tables, make_layout, tables
 from wlm_kernels.fluid.lattice_sets import lattice as velocity_set
 
 BODIES = 256
@@ -52,7 +52,7 @@ class Setup:
         shape: Cells along x, y and z.
         spec: The settings for which the kernel of a step is specialised.
         tables: The velocity set.
-        bounded: 1 for each axis that is not periodic, else 0.
+        layout: The domain, and the layout of populations of parity 0.
         tau, eddy: Relaxation time, and factor of the eddy viscosity.
         ramp: Number of steps in which inlets rise to their velocity.
         links: The links of faces and solids.
@@ -68,7 +68,7 @@ class Setup:
     shape: tuple[int, int, int]
     spec: Spec
     tables: Tables
-    bounded: wp.vec3i
+    layout: Layout
     tau: float
     eddy: float
     ramp: int
@@ -124,7 +124,7 @@ class Lattice:
         WlmError: There is not enough memory.
     """
 
-    period = 2  # the two buffers have then swapped back
+    period = 2  # the populations are then where they were
 
     def __init__(
         self,
@@ -153,7 +153,8 @@ class Lattice:
         size = (len(self._set.c), self._cells)
         # The settings for which the kernel of a step is specialised.
         self._spec = replace(spec, wide=math.prod(size) > NARROW)
-        self._f = [self._zeros(size, STORAGES[storage][0]) for _ in range(2)]
+        # The populations, and their parity, see `wlm_kernels.fluid.lattice_sets.MemoryFunctions`.
+        self._f, self._parity = self._zeros(size, STORAGES[storage][0]), 0
         # A ramp of one step is no ramp: inflow begins after it.
         self._tau, self._eddy, self._rise = 0.5 + 3.0 * viscosity, eddy_factor(smagorinsky), 1.0 / max(ramp, 1)
         # The counter of steps and the first error, see `wlm_kernels.fluid.lattice.step_kernel`.
@@ -177,7 +178,7 @@ class Lattice:
     def bytes_needed(shape: tuple[int, int, int], storage: str = "float32", lattice: str = "D3Q19") -> int:
         """Returns the memory in bytes that a lattice takes, without small arrays; arguments as for `Lattice`."""
         size = wp.types.type_size_in_bytes(STORAGES[storage][0])
-        return 2 * len(velocity_set(lattice).c) * math.prod(shape) * size
+        return len(velocity_set(lattice).c) * math.prod(shape) * size
 
     # Setting up.
 
@@ -289,16 +290,15 @@ class Lattice:
         """Makes the cells of a mask, uint8 [N], solid, and the others fluid."""
         if self._solid.shape[0] == 0:
             self._solid, self._graph = self._zeros(self._cells, wp.uint8), None
+        else:
+            means, where = self._zeros((4, self._cells), self._f.dtype), [self._tables, self._layout]
+            inputs = [*where, self._f, self._solid, new]
+            self._launch(self._fluid_kernels.neighbours, self._cells, inputs, [means])
+            self._launch(self._fluid_kernels.uncover, self._cells, [*where, self._solid, new, means], [self._f])
         self._spec = replace(self._spec, solids=True)
-        now, spare = self._buffers
-        common = [self._tables, self._n, self._bounded]
-        inputs = [*common, now, self._solid, new]
-        self._launch(self._fluid_kernels.neighbours, self._cells, inputs, [spare])
-        inputs = [*common, self._walled, self._solid, new, spare]
-        self._launch(self._fluid_kernels.uncover, self._cells, inputs, [now])
         wp.copy(self._solid, new)
         self._find_links()
-        self._apply_links(self._links.faces, now)
+        self._apply_links(self._links.faces)
 
     def set_force(self, force: ArrayLike | wp.array | None) -> None:
         """Sets the force on the air.
@@ -329,12 +329,10 @@ class Lattice:
         drho = (np.broadcast_to(np.asarray(density, np.float64), self.shape) - 1.0).astype(np.float32).ravel()
         if not np.isfinite(drho).all():
             raise ValueError("density: expected finite numbers, got NaN or infinity")
-        inputs = [self._tables, wp.array(drho, device=self.device), self._vectors("velocity", velocity)]
-        now, spare = self._buffers
-        spare.zero_()
+        fields = [wp.array(drho, device=self.device), self._vectors("velocity", velocity)]
         self._sums.zero_()
-        self._launch(self._fluid_kernels.start, self._cells, inputs, [now])
-        self._apply_links(0, now)
+        self._launch(self._fluid_kernels.start, self._cells, [self._tables, self._layout, *fields], [self._f])
+        self._apply_links(0)
         self._begun = True
 
     @property
@@ -394,7 +392,7 @@ class Lattice:
     @property
     def steps(self) -> int:
         """Number of steps done, including replays of graphs; waits for the device."""
-        return int(self._clock.numpy()[self._done % 2])
+        return int(self._clock.numpy()[self._parity])
 
     def check(self) -> None:
         """Checks that the flow has not blown up, which every step records on the device; waits for the device.
@@ -469,15 +467,17 @@ class Lattice:
             links = self._links
             if self.moving:
                 links = self._with_solids(self._make_links(0), every=True)
-            inputs = [self._tables, self._n, self._bounded, links, self._solid, self._buffers[0]]
+            inputs = [self._tables, self._layout, links, self._solid, self._f]
             self._launch(self._link_kernels.force, links.cell.shape[0], inputs, [total])
         return total.numpy()[body]
 
     def state(self) -> dict[str, np.ndarray]:
-        """Returns the state, for `load`: populations as stored, solid cells and their motion, number of steps done."""
+        """Returns the state, for `load`: populations that have left the cells, solid cells and their motion, number of
+        steps done."""
+        self._prepare()
         # On a CPU .numpy() shares the array's memory, which the next step modifies.
         return {
-            "populations": self._buffers[0].numpy().copy(),
+            "populations": np.stack([row.numpy() for row in self._rows()]),
             "solid": self._solid.numpy().copy(),
             "bodies": self._motion.velocity.numpy().copy(),
             "steps": np.array(self.steps, np.int64),
@@ -493,9 +493,8 @@ class Lattice:
         Raises:
             WlmError: The state has another shape, lattice or storage, or contains NaN or infinity.
         """
-        now = self._buffers[0]
         table = {
-            "populations": Part(wp.dtype_to_numpy(now.dtype), now.shape),
+            "populations": Part(wp.dtype_to_numpy(self._f.dtype), self._f.shape),
             # Empty while no cell has ever been solid.
             "solid": Part(np.uint8, (0 if np.shape(state.get("solid")) == (0,) else self._cells,)),
             "bodies": Part(np.float32, (BODIES, 3)),
@@ -507,15 +506,13 @@ class Lattice:
             raise WlmError(f"lattice state: {error}") from error
         self._convert_settings(factor)
         self._motion.velocity.assign(state["bodies"])
-        self._begun, self._done, self._graph = True, int(state["steps"]), None
+        self._begun, self._done, self._parity, self._graph = True, int(state["steps"]), 0, None
         self._clock.fill_(self._done)
         self._trouble.fill_(QUIET)
         self._solid = self._zeros(len(state["solid"]), wp.uint8)
         self._solid.assign(state["solid"])
         self._spec = replace(self._spec, solids=len(state["solid"]) > 0)
-        now, spare = self._buffers
-        now.assign(state["populations"])
-        spare.zero_()
+        self._f.assign(state["populations"])
         self._find_links()
         if self._bodies is not None:
             self._place()
@@ -538,14 +535,10 @@ class Lattice:
         if done < 0 or not math.isclose(done * factor, self.steps):
             raise ValueError(f"factor: expected one that divides {self.steps} steps into whole ones, got {factor}")
         self._prepare()
-        now, spare = self._buffers
-        where = [self._tables, self._n, self._bounded, self._walled]
-        inputs = [*where, now, self._solid, self._forces, self._tau, self._eddy, factor]
-        self._launch(self._fluid_kernels.convert, self._cells, inputs, [spare])
+        inputs = [self._tables, self._layout, self._solid, self._forces, self._tau, self._eddy, factor]
+        self._launch(self._fluid_kernels.convert, self._cells, inputs, [self._f])
         self._done, self._graph = done, None
         self._clock.fill_(done)
-        if self._buffers[0] is now:
-            self._f.reverse()
         velocity = factor * self._motion.velocity.numpy()
         _check_speed(float(np.linalg.norm(velocity, axis=1).max()), "a body")
         self._motion.velocity.assign(velocity)
@@ -582,7 +575,7 @@ class Lattice:
             shape=self.shape,
             spec=self._spec,
             tables=self._tables,
-            bounded=self._bounded,
+            layout=self._layouts[0],
             tau=self._tau,
             eddy=self._eddy,
             ramp=round(1.0 / self._rise),
@@ -598,9 +591,12 @@ class Lattice:
         )
 
     def populations(self) -> wp.array:
-        """Returns a copy of the populations as the lattice stores them, [Q, X, Y, Z], see `state`."""
+        """Returns a copy of the populations that have left the cells, [Q, X, Y, Z], see `state`."""
         self._prepare()
-        return wp.clone(self._buffers[0]).reshape((len(self._set.c), *self.shape))
+        out = wp.empty_like(self._f)
+        for q, row in enumerate(self._rows()):
+            wp.copy(out[q], row)
+        return out.reshape((len(self._set.c), *self.shape))
 
     # Checked arguments.
 
@@ -639,9 +635,17 @@ class Lattice:
     # On the device.
 
     @property
-    def _buffers(self) -> tuple[wp.array, wp.array]:
-        """The array of populations that the next step reads, and the array that it writes."""
-        return self._f[self._done % 2], self._f[1 - self._done % 2]
+    def _layout(self) -> Layout:
+        return self._layouts[self._parity]
+
+    def _rows(self) -> Iterator[wp.array]:
+        """Gives each population that has left the cells, [N], in a new array: a copy of all would double the memory."""
+        for q, velocity in enumerate(self._set.c):
+            out = self._zeros(self._cells, self._f.dtype)
+            self._launch(
+                self._fluid_kernels.unpack, self._cells, [self._layout, q, wp.vec3i(*velocity), self._f], [out]
+            )
+            yield out
 
     def _prepare(self) -> None:
         """Chooses kernels and lists links for the faces, if they have changed since the last call."""
@@ -650,10 +654,10 @@ class Lattice:
         self._bounded = wp.vec3i(*bounded_axes(self._faces))
         walls = walled_axes(self._faces)
         self._spec = replace(self._spec, walls=walls)
-        self._walled = wp.vec3i(*(int(wall) for wall in walls))
+        self._layouts = [make_layout(self.shape, self._bounded, walls, parity) for parity in range(2)]
         kinds = {int(kind) for face in self._faces.values() for kind in np.unique(face.kind)}
         sets = self._spec.lattice, self._spec.storage
-        self._link_kernels = lattice_links.link_kernels(*sets, OUTLET in kinds)
+        self._link_kernels = lattice_links.link_kernels(*sets, OUTLET in kinds, self._spec.wide)
         self._fluid_kernels = fluid_kernels(*sets, walls)
         links = face_links(self.shape, self._set, self._faces)
         # The links of one slab after those of the other.
@@ -702,19 +706,20 @@ class Lattice:
     def _run(self, steps: int) -> None:
         """Queues steps on the device and returns without waiting."""
         for _ in range(steps):
-            now, out = self._buffers
-            inputs = [self._n, now, self._solid, self._tau, self._eddy, self._forces, self._done % 2]
-            outputs = [self._clock, self._trouble, self._sums, out]
+            before, after = self._parity, 1 - self._parity
+            inputs = [self._n, self._f, self._solid, self._tau, self._eddy, self._forces, before, after]
+            outputs = [self._clock, self._trouble, self._sums, self._f]
             # Small blocks are faster with solids, large ones without (docs/notes/fluid-speed.md).
             block_dim = 128 if self._spec.solids else 256
             self.slabs.launch(step_kernel(self._spec), inputs, outputs, block_dim)
+            self._parity = after
             if self._growth is not None:
                 expand = expand_kernel(self._spec.lattice, self._spec.storage)
-                self.slabs.launch(expand, [self._tables, self._growth], [out])
+                self.slabs.launch(expand, [self._tables, self._layout, self._growth], [self._f])
             stamp = 1 + self._done % 2
             if self.moving:
                 self._bodies.move(self._clock, self._pace, self._solid, self._fresh, stamp)
-            self._apply_links(0, out, stamp)
+            self._apply_links(0, stamp)
             self._done += 1
 
     def _run_in_graphs(self, steps: int) -> None:
@@ -736,20 +741,20 @@ class Lattice:
 
     def _write_fields(self, drho: wp.array, u: wp.array) -> None:
         """Writes the density minus 1 of each cell to `drho` and the velocity to `u`; an array of size 0 is skipped."""
-        inputs = [self._n, self._buffers[0], self._solid, self._motion, self._forces]
+        inputs = [self._layout, self._f, self._solid, self._motion, self._forces]
         self.slabs.launch(self._fluid_kernels.fields, inputs, [drho, u])
 
-    def _apply_links(self, first: int, f: wp.array, stamp: int = _STALE) -> None:
+    def _apply_links(self, first: int, stamp: int = _STALE) -> None:
         """Applies the boundary conditions from link `first` on; cells that bodies have left have the mark `stamp`."""
         for window in self._bodies.moving if self.moving else ():
-            where = [self._bounded, window, self._motion, stamp, self._solid, self._fresh]
-            lattice_links.bounce(self._link_kernels, *where, f, self._sums)
+            where = [self._tables, self._layout, window, self._motion, stamp, self._solid, self._fresh]
+            lattice_links.bounce(self._link_kernels, *where, self._f, self._sums)
         links = self._links
         if first == links.cell.shape[0]:
             return
         # The links of solids are the last slab's.
         ends = [*self._parts, links.cell.shape[0]]
-        where = [self._n, self._bounded, links, self._solid, self._clock, self._rise, f, self._sums]
+        where = [self._layout, links, self._solid, self._clock, self._rise, self._f, self._sums]
 
         def apply(slab: Slab, *, writing: bool) -> None:
             of = tables(self._spec.lattice, str(slab.device)), slab

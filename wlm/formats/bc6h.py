@@ -60,12 +60,8 @@ _MODES = (
     (0x0F, 16, (4, 4, 4), f"{_WX} rx0-3 rw15-10 gx0-3 gw15-10 bx0-3 bw15-10"),
 )  # fmt: skip
 
-TWO_LINES = 10
-"""Modes before this row of `MODES` have two lines."""
-
-PARTITION = 12
-"""The number of the partition's field in `LAYOUT`."""
-_PARTITION_BITS = 5
+_TWO_LINES = 10  # modes before this one have two lines
+_PARTITION = 12  # the number of the partition's field
 
 
 def _fields(text: str) -> list[int]:
@@ -84,27 +80,23 @@ def _layout() -> np.ndarray:
     layout = np.full((len(_MODES), 82), -1, np.int32)
     for row, (number, _, _, text) in enumerate(_MODES):
         codes = _fields(text)
-        if row < TWO_LINES:
-            codes += [PARTITION << 4 | bit for bit in range(_PARTITION_BITS)]
+        if row < _TWO_LINES:
+            codes += [_PARTITION << 4 | bit for bit in range(5)]
         begin = 2 if number < 2 else 5
         layout[row, begin : begin + len(codes)] = codes
     return layout
 
 
-LAYOUT = _layout()
-"""int32 [14, 82]: for each row of `MODES`, the meaning of each bit of a block: 16 times the number of the field, plus
-the bit in it; -1 for bits of the mode's number and of indices. Field 4 c + e is channel c (red, green, blue) of
-endpoint e (w, x, y, z)."""
-
-MODES = np.array(
-    [[number, 2 if number < 2 else 5, number not in (0x03, 0x1E), bits, *others] for number, bits, others, _ in _MODES],
-    np.int32,
-)
-"""int32 [14, 7]: the mode's number, its number of bits, whether x, y and z are differences, bits of w, and bits of the
-others' red, green and blue."""
-
-MASKS = np.array([sum((int(word) >> 2 * i & 1) << i for i in range(16)) for word in PARTITIONS[1, :32]], np.int32)
-"""int32 [32]: the texels on the second line of each partition, one bit per texel."""
-
-SECOND_ANCHORS = np.ascontiguousarray(ANCHORS[1, :32, 0])
-"""int32 [32]: the anchor texel of the second line."""
+TABLES = {
+    "modes": np.array(
+        [
+            [number, 2 if number < 2 else 5, number not in (0x03, 0x1E), bits, *others]
+            for number, bits, others, _ in _MODES
+        ],
+        np.int32,
+    ),
+    "layout": _layout(),
+    "masks": np.array([sum((int(word) >> 2 * i & 1) << i for i in range(16)) for word in PARTITIONS[1, :32]], np.int32),
+    "anchors": np.ascontiguousarray(ANCHORS[1, :32, 0]),
+}
+"""The tables of `wlm_kernels.bc6h.Tables`, int32, by name."""

@@ -16,19 +16,9 @@ from wlm.workers import cores, each
 from wlm_kernels import astc as astc_kernels
 from wlm_kernels import bc6h as bc6h_kernels
 
-_FINITE = 0x7C00  # bits of the first half float that isn't finite
 _BLOCKS_A_THREAD = 256  # the least work of a thread on the CPU, about 20 ms
 _CODECS: dict[str, tuple[ModuleType, dict[str, np.ndarray]]] = {
-    "bc6h": (
-        bc6h_kernels,
-        {
-            "modes": bc6h.MODES,
-            "layout": bc6h.LAYOUT,
-            "masks": bc6h.MASKS,
-            "anchors": bc6h.SECOND_ANCHORS,
-            "halves": np.arange(_FINITE, dtype=np.uint16).view(np.float16).astype(np.float32),
-        },
-    ),
+    "bc6h": (bc6h_kernels, bc6h.TABLES),
     "astc": (astc_kernels, astc.TABLES),
 }
 
@@ -66,7 +56,8 @@ def encoded_blocks(
 
 @functools.cache
 def _tables(codec: str, device: str) -> Any:
-    tables = _CODECS[codec][0].Tables()
-    for name, values in _CODECS[codec][1].items():
-        setattr(tables, name, wp.array(values, dtype=float if values.dtype == np.float32 else int, device=device))
+    kernels, arrays = _CODECS[codec]
+    tables = kernels.Tables()
+    for name, values in arrays.items():
+        setattr(tables, name, wp.array(values, dtype=int, device=device))
     return tables

@@ -19,7 +19,16 @@ import warp as wp
 
 from wlm_kernels.fluid.advection import Fields, fields_struct
 from wlm_kernels.fluid.advection_places import Box, Bricks, address_of, is_solid
-from wlm_kernels.fluid.lattice_sets import STORAGES, Slab, Tables, cell_of, equilibrium, launch_slab, memory_functions
+from wlm_kernels.fluid.lattice_sets import (
+    STORAGES,
+    Layout,
+    Slab,
+    Tables,
+    cell_of,
+    equilibrium,
+    launch_slab,
+    memory_functions,
+)
 
 # Largest growth of the gas in a cell and step of the lattice.
 _MOST = wp.constant(0.02)
@@ -112,20 +121,23 @@ def expand_kernel(lattice_name: str, storage: str) -> wp.Kernel:
     It changes the populations `f`, [Q, N], that leave the cells, before boundary conditions act; solid cells have none.
     """
     memory, stored = memory_functions(lattice_name, storage, (False, False, False)), STORAGES[storage][0]
-    load, store = memory.load, memory.store
+    load, store, leaving = memory.load, memory.store, memory.leaving
 
     @wp.kernel(module="unique", module_options=_OPTIONS)
-    def expand(first: int, t: Tables, growth: wp.array1d[float], f: wp.array2d[stored]):
+    def expand(first: int, t: Tables, at: Layout, growth: wp.array1d[float], f: wp.array2d[stored]):
         i = first + wp.tid()
         if growth[i] == 0.0:
             return
+        p = cell_of(at.n, i)
         rho = float(1.0)
         j = wp.vec3()
         for q in range(t.w.shape[0]):
-            rho += load(f, q, i)
-            j += load(f, q, i) * wp.vec3(float(t.c[q][0]), float(t.c[q][1]), float(t.c[q][2]))
+            left = load(f, leaving(f, at, i, p, q, t.c[q]))
+            rho += left
+            j += left * wp.vec3(float(t.c[q][0]), float(t.c[q][1]), float(t.c[q][2]))
         for q in range(t.w.shape[0]):
             share = t.w[q] + equilibrium(t.w[q], t.c[q], 0.0, j / rho)
-            store(f, q, i, load(f, q, i) + growth[i] * rho * share)
+            k = leaving(f, at, i, p, q, t.c[q])
+            store(f, k, load(f, k) + growth[i] * rho * share)
 
     return expand

@@ -1,12 +1,12 @@
-"""The lattice Boltzmann step: streaming and collision in one pass over two buffers.
+"""The lattice Boltzmann step: streaming and collision in one pass, in place.
 
 Read `tests/reference/lattice.py` first: it is the same step in float64 NumPy, cell by cell.
 
-A cell pulls the populations that arrive, f_q(x, t + 1) = f*_q(x - c_q, t), and writes the populations that leave, f*.
-At a wall at rest that closes a whole axis the cell pulls the population that it sent there itself (half-way
-bounce-back). All other boundaries are the work of `lattice_links`: no cell but this one reads the array element from
-which it would pull beyond a face or out of a solid, so the value that the boundary returns is written into that element
-after the step. The kernel therefore has no branch except the one that skips solid cells.
+A cell reads the populations that arrive, f_q(x, t + 1) = f*_q(x - c_q, t), and writes the populations that leave, f*,
+into the same array elements (`lattice_sets.MemoryFunctions`), which no other cell reads or writes in this step. At a
+wall at rest that closes a whole axis the population that the cell sent there itself arrives (half-way bounce-back). All
+other boundaries are the work of `lattice_links`: the value that the boundary returns is written after the step into the
+element of the population that arrives from beyond a face or out of a solid.
 
 Collision, with Kupershtokh's exact difference for a force F; the velocity of the fluid is u + F / (2 rho):
 
@@ -31,7 +31,7 @@ from typing import Any
 
 import warp as wp
 
-from wlm_kernels.fluid.lattice_sets import PAIRS, STORAGES, cell_of, lattice, memory_functions
+from wlm_kernels.fluid.lattice_sets import PAIRS, STORAGES, lattice, memory_functions
 
 CAUSES = ("the density is not positive", "the speed exceeds that of sound", "not a number")
 """Reasons why a run stops, in the order of their codes."""
@@ -45,6 +45,7 @@ _OPTIONS = {"enable_backward": False, "max_unroll": 32, "fast_math": True}
 # A key is (step * 2^31 + cell) * 4 + cause, so that the smallest key is that of the first cell in the first step.
 _CELLS = wp.constant(wp.int64(1 << 31))
 _CODES = wp.constant(wp.int64(4))
+_ALL = wp.constant(wp.vec3i(1, 1, 1))
 _SOUND2 = wp.constant(1.0 / 3.0)
 
 
@@ -158,20 +159,20 @@ def step_kernel(spec: Spec) -> wp.Kernel:
     Args of the kernel, for N cells and Q velocities:
         first: Index of the slab's first cell.
         n: Cells along x, y and z.
-        f: [Q, N], the populations that left every cell in the last step.
+        f: [Q, N], the populations that left every cell in the last step, in an array of parity `parity`.
         solid: uint8 [N], above 0 where a cell is solid; used if `spec.solids`.
         tau: Relaxation time, 1/2 + 3 nu.
         eddy: `eddy_factor`, used if `spec.eddies`.
         forces: vec3 [N], acceleration of each cell's fluid in cells per step squared, used if `spec.forced`.
         parity: 0 or 1: `clock[parity]` is the number of steps done; the step writes one more to the other element.
+        after: Parity of `out`: the other one if `out` is `f`.
         clock: int [2], counts steps.
         trouble: int64 [1], lowered to the key of the first cell in which the flow blew up, see `trouble_of`.
         sums: float64 [2 P], set to 0, for `lattice_links.apply`.
-        out: [Q, N], the populations that leave every cell in this step.
+        out: [Q, N], `f` or another array: the populations that leave every cell in this step.
     """
     memory, relax = memory_functions(spec.lattice, spec.storage, spec.walls, spec.wide), _relax(spec)
-    gather, moments, put = memory.gather, memory.moments, memory.put
-    stored, count_q = STORAGES[spec.storage][0], len(lattice(spec.lattice).c)
+    gather, moments, scatter, stored = memory.gather, memory.moments, memory.scatter, STORAGES[spec.storage][0]
 
     @wp.kernel(module="unique", module_options=_OPTIONS)
     def step(
@@ -184,6 +185,7 @@ def step_kernel(spec: Spec) -> wp.Kernel:
         eddy: float,
         forces: wp.array1d[wp.vec3],
         parity: int,
+        after: int,
         # out:
         clock: wp.array1d[int],
         trouble: wp.array1d[wp.int64],
@@ -198,8 +200,7 @@ def step_kernel(spec: Spec) -> wp.Kernel:
         if wp.static(spec.solids):
             if solid[i] != wp.uint8(0):
                 return
-        g = gather(f, n, cell_of(n, i))
-        drho, j, diagonal, off = moments(g)
+        drho, j, diagonal, off = moments(gather(f, n, _ALL, i, parity))
         rho = 1.0 + drho
         j2 = wp.dot(j, j)
         if not (rho > 0.0 and j2 < _SOUND2 * rho * rho):
@@ -213,8 +214,6 @@ def step_kernel(spec: Spec) -> wp.Kernel:
         push = wp.vec3()
         if wp.static(spec.forced):
             push = forces[i]
-        left = relax(drho, j, diagonal, off, push, tau, eddy)
-        for q in range(wp.static(count_q)):
-            put(out, q, i, left[q])
+        scatter(out, n, _ALL, i, after, relax(drho, j, diagonal, off, push, tau, eddy))
 
     return step

@@ -51,19 +51,12 @@ def _is_solid(flow: Flow, i: int) -> bool:
 
 
 @wp.func
-def _around(i: int, n: int) -> int:
-    """Returns the periodic image of an index that is at most one outside."""
-    return wp.where(i < 0, i + n, wp.where(i >= n, i - n, i))
-
-
-@wp.func
 def _pulled(t: Tables, flow: Flow, i: int, p: wp.vec3i, q: int):
     """Returns the direction and the cell of the population that arrives at cell i (at p) as population q."""
     source = p - t.c[q]
     if crosses(flow.n, flow.walled, source):
         return opposite(q), i
-    n = flow.n
-    return q, index_of(n, wp.vec3i(_around(source[0], n[0]), _around(source[1], n[1]), _around(source[2], n[2])))
+    return q, index_of(flow.n, wrapped(flow.n, source))
 
 
 @wp.func

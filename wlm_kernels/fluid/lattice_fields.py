@@ -12,6 +12,7 @@ import warp as wp
 from wlm_kernels.fluid.lattice_bodies import Motion, centre_of, wall_velocity
 from wlm_kernels.fluid.lattice_sets import (
     STORAGES,
+    Layout,
     Tables,
     cell_of,
     crosses,
@@ -30,7 +31,7 @@ class FluidKernels:
     """Kernels for one lattice and storage type, with one thread per cell: `fields` computes the density minus 1 and the
     velocity in a slab, `start` sets the equilibrium of given ones; for each cell that becomes fluid, `neighbours`
     computes the means of the fluid around it, and `uncover` sets the equilibrium of these; `convert` converts all cells
-    to another time step.
+    to another time step, in place; `unpack` copies a population that has left the cells.
     """
 
     fields: wp.Kernel
@@ -38,6 +39,7 @@ class FluidKernels:
     neighbours: wp.Kernel
     uncover: wp.Kernel
     convert: wp.Kernel
+    unpack: wp.Kernel
 
 
 @functools.cache
@@ -45,7 +47,8 @@ def fluid_kernels(lattice_name: str, storage: str, walls: tuple[bool, bool, bool
     """Builds (once) the kernels that read and set the fluid's density and velocity; `walls`: axes with walls."""
     memory = memory_functions(lattice_name, storage, walls)
     gather, moments, load, store = memory.gather, memory.moments, memory.load, memory.store
-    stored = STORAGES[storage][0]
+    element, arriving, leaving = memory.element, memory.arriving, memory.leaving
+    stored, scale = STORAGES[storage]
     flat = velocity_set(lattice_name).axes == 2
     options = {"enable_backward": False, "max_unroll": 32}
 
@@ -53,7 +56,7 @@ def fluid_kernels(lattice_name: str, storage: str, walls: tuple[bool, bool, bool
     def fields(
         # in:
         first: int,
-        n: wp.vec3i,
+        at: Layout,
         f: wp.array2d[stored],
         solid: wp.array1d[wp.uint8],
         motion: Motion,
@@ -69,9 +72,9 @@ def fluid_kernels(lattice_name: str, storage: str, walls: tuple[bool, bool, bool
         if solid.shape[0] > 0:
             body = int(solid[i])
         if body > 0:
-            v = wall_velocity(motion, body, centre_of(cell_of(n, i)))
+            v = wall_velocity(motion, body, centre_of(cell_of(at.n, i)))
         else:
-            excess, j, _diagonal, _off = moments(gather(f, n, cell_of(n, i)))
+            excess, j, _diagonal, _off = moments(gather(f, at.n, at.walled, i, at.parity))
             if forces.shape[0] > 0:
                 j += 0.5 * forces[i]
             v = j / (1.0 + excess)
@@ -84,98 +87,94 @@ def fluid_kernels(lattice_name: str, storage: str, walls: tuple[bool, bool, bool
     def start(
         # in:
         t: Tables,
+        at: Layout,
         drho: wp.array1d[float],
         u: wp.array1d[wp.vec3],
         # out:
         f: wp.array2d[stored],
     ):
         i = wp.tid()
+        p = cell_of(at.n, i)
         for q in range(t.w.shape[0]):
-            store(f, q, i, equilibrium(t.w[q], t.c[q], drho[i], u[i]))
+            store(f, leaving(f, at, i, p, q, t.c[q]), equilibrium(t.w[q], t.c[q], drho[i], u[i]))
 
     @wp.kernel(module="unique", module_options=options)
     def neighbours(
         # in:
         t: Tables,
-        n: wp.vec3i,
-        bounded: wp.vec3i,
+        at: Layout,
         f: wp.array2d[stored],
         covered: wp.array1d[wp.uint8],
         solid: wp.array1d[wp.uint8],
         # out:
-        spare: wp.array2d[stored],
+        means: wp.array2d[stored],
     ):
         i = wp.tid()
         if covered[i] == wp.uint8(0) or solid[i] != wp.uint8(0):
             return
-        p = cell_of(n, i)
+        p = cell_of(at.n, i)
         total = wp.vec4()
         weight = float(0.0)
         for q in range(1, t.w.shape[0]):
             beside = p + t.c[q]
-            if not crosses(n, bounded, beside):
-                neighbour = wrapped(n, beside)
-                k = index_of(n, neighbour)
+            if not crosses(at.n, at.bounded, beside):
+                k = index_of(at.n, wrapped(at.n, beside))
                 if covered[k] == wp.uint8(0) and solid[k] == wp.uint8(0):
-                    excess, j, _diagonal, _off = moments(gather(f, n, neighbour))
+                    excess, j, _diagonal, _off = moments(gather(f, at.n, at.walled, k, at.parity))
                     rho = 1.0 + excess
                     total += t.w[q] * wp.vec4(excess, j[0] / rho, j[1] / rho, j[2] / rho)
                     weight += t.w[q]
         if weight > 0.0:
             total = total / weight
         for k in range(4):
-            store(spare, k, i, total[k])
+            store(means, element(means, k, i), total[k])
 
     @wp.kernel(module="unique", module_options=options)
     def uncover(
         # in:
         t: Tables,
-        n: wp.vec3i,
-        bounded: wp.vec3i,
-        walled: wp.vec3i,
+        at: Layout,
         covered: wp.array1d[wp.uint8],
         solid: wp.array1d[wp.uint8],
-        spare: wp.array2d[stored],
+        means: wp.array2d[stored],
         # out:
         f: wp.array2d[stored],
     ):
         i = wp.tid()
         if covered[i] == wp.uint8(0) or solid[i] != wp.uint8(0):
             return
-        drho = load(spare, 0, i)
-        u = wp.vec3(load(spare, 1, i), load(spare, 2, i), load(spare, 3, i))
-        p = cell_of(n, i)
+        drho = load(means, element(means, 0, i))
+        u = wp.vec3()
+        for a in range(3):
+            u[a] = load(means, element(means, a + 1, i))
+        p = cell_of(at.n, i)
         for q in range(t.w.shape[0]):
             value = equilibrium(t.w[q], t.c[q], drho, u)
             # The element of a link stores the population that comes in next, for this cell also the equilibrium.
-            if owned(n, bounded, walled, p + t.c[q]):
-                store(f, q, i, value)
-            if not owned(n, bounded, walled, p - t.c[q]):
-                store(f, q, index_of(n, wrapped(n, p - t.c[q])), value)
+            if owned(at, p + t.c[q]):
+                store(f, leaving(f, at, i, p, q, t.c[q]), value)
+            if not owned(at, p - t.c[q]):
+                store(f, arriving(f, at, i, p, q, t.c[q]), value)
 
     @wp.kernel(module="unique", module_options=options)
     def convert(
         # in:
         t: Tables,
-        n: wp.vec3i,
-        bounded: wp.vec3i,
-        walled: wp.vec3i,
-        f: wp.array2d[stored],
+        at: Layout,
         solid: wp.array1d[wp.uint8],
         forces: wp.array1d[wp.vec3],
         tau: float,
         eddy: float,
         factor: float,
-        # out:
-        out: wp.array2d[stored],
+        # in, out:
+        f: wp.array2d[stored],
     ):
         i = wp.tid()
         if solid.shape[0] > 0:
             if solid[i] != wp.uint8(0):
                 return
-        p = cell_of(n, i)
-        g = gather(f, n, p)
-        drho, j, diagonal, off = moments(g)
+        p = cell_of(at.n, i)
+        drho, j, diagonal, off = moments(gather(f, at.n, at.walled, i, at.parity))
         u = j / (1.0 + drho)
         third = drho / 3.0
         diagonal -= wp.cw_mul(j, u) + wp.vec3(third, third, third)
@@ -200,15 +199,25 @@ def fluid_kernels(lattice_name: str, storage: str, walls: tuple[bool, bool, bool
             stress += 9.0 * (off[0] * c[0] * c[1] + off[1] * c[0] * c[2] + off[2] * c[1] * c[2])
             value = t.w[q] * (after + 3.0 * wp.dot(c, j) + stress)
             source = p - t.c[q]
-            if crosses(n, walled, source):
-                store(out, opposite(q), i, value)
-            else:
-                k = index_of(n, wrapped(n, source))
-                store(out, q, k, value)
-                if solid.shape[0] > 0 and not crosses(n, bounded, source):
-                    if solid[k] != wp.uint8(0):
-                        # The population that left towards the body, from which a wall's velocity sends it back.
-                        wall = load(f, q, k) - load(f, opposite(q), i)
-                        store(out, opposite(q), i, value - factor * wall)
+            came = arriving(f, at, i, p, q, t.c[q])
+            if solid.shape[0] > 0 and not crosses(at.n, at.bounded, source):
+                if solid[index_of(at.n, wrapped(at.n, source))] != wp.uint8(0):
+                    # The population that left towards the body, from which a wall's velocity sends it back.
+                    toward = leaving(f, at, i, p, opposite(q), -t.c[q])
+                    store(f, toward, value - factor * (load(f, came) - load(f, toward)))
+            store(f, came, value)
 
-    return FluidKernels(fields, start, neighbours, uncover, convert)
+    @wp.kernel(module="unique", module_options=options)
+    def unpack(
+        # in:
+        at: Layout,
+        q: int,
+        c_q: wp.vec3i,
+        f: wp.array2d[stored],
+        # out:
+        out: wp.array1d[stored],
+    ):
+        i = wp.tid()
+        out[i] = stored(wp.static(scale) * load(f, leaving(f, at, i, cell_of(at.n, i), q, c_q)))
+
+    return FluidKernels(fields, start, neighbours, uncover, convert, unpack)

@@ -3,10 +3,10 @@
 Read `tests/reference/lattice.py` first: `stream` there has the same conditions in float64 NumPy, link by link.
 
 A link is a fluid cell a and a direction q from which a population arrives from beyond a face of the domain or out of a
-solid. (Axes closed by walls at rest have no links: the step of `lattice` handles them.) The element from which cell a
-pulls this population, population q of the periodic image of the cell a - c_q, is read by no other cell. After every
-step the values of the links are computed from the populations f* that have just left the cells, and are then written
-into these elements. This takes two passes, since the element of one link may be read by another.
+solid. (Axes closed by walls at rest have no links: the step of `lattice` handles them.) The element of this population,
+as if it came from the periodic image of the cell a - c_q, is read by no other cell. After every step the values of the
+links are computed from the populations f* that have just left the cells, and are then written into these elements. This
+takes two passes, since the element of one link may be read by another.
 
 - bounce: f_q = f*_opposite + term, half-way bounce-back; the term is 6 w_q c_q . u at a wall of velocity u.
 - inlet: the same formula; it adds a mass of u per cell of the face. The term may rise from 0 in the first steps.
@@ -30,7 +30,9 @@ import warp as wp
 
 from wlm_kernels.fluid.lattice_bodies import Motion, Window, centre_of, size_of, wall_velocity, window_cell
 from wlm_kernels.fluid.lattice_sets import (
+    OPPOSITE,
     STORAGES,
+    Layout,
     Slab,
     Tables,
     cell_of,
@@ -106,38 +108,39 @@ def mirrored(t: Tables, n: wp.vec3i, bounded: wp.vec3i, i: int, q: int):
 
 
 @functools.cache
-def link_kernels(lattice_name: str, storage: str, balance: bool) -> LinkKernels:
-    """Builds (once) the kernels that set populations at boundaries and sum forces; `balance`: outlets conserve mass."""
-    memory = memory_functions(lattice_name, storage, (False, False, False))
-    load, store, moments, vec = memory.load, memory.store, memory.moments, memory.vec
+def link_kernels(lattice_name: str, storage: str, balance: bool, wide: bool = True) -> LinkKernels:
+    """Builds (once) the kernels that set populations at boundaries and sum forces; `balance`: outlets conserve mass;
+    `wide` as for `memory_functions`."""
+    memory = memory_functions(lattice_name, storage, (True, True, True), wide)
+    gather, load, store, moments, vec = memory.gather, memory.load, memory.store, memory.moments, memory.vec
+    element, arriving, leaving = memory.element, memory.arriving, memory.leaving
     stored = STORAGES[storage][0]
     c, w = velocity_set(lattice_name).c, velocity_set(lattice_name).w
     count, options = len(c), {"enable_backward": False, "max_unroll": 32}
 
     @wp.func
-    def moments_at(f: wp.array2d[stored], i: int):
-        # The loop is unrolled: the latency of reads one after the other would take longer than a step.
-        g = vec()
+    def moments_at(f: wp.array2d[stored], at: Layout, i: int):
+        # What has left a cell is where, with the other parity, the same arrives from the opposite directions.
+        g = gather(f, at.n, at.walled, i, 1 - at.parity)
+        left = vec()
         for r in range(wp.static(count)):
-            g[r] = load(f, r, i) * wp.static(STORAGES[storage][1])
-        return moments(g)
+            left[r] = g[wp.static(OPPOSITE[r])]
+        return moments(left)
 
     @wp.func
-    def outflow(
-        t: Tables, n: wp.vec3i, bounded: wp.vec3i, f: wp.array2d[stored], i: int, q: int, kind: int, term: float
-    ) -> float:
-        drho, j, _diagonal, _off = moments_at(f, i)
+    def outflow(t: Tables, at: Layout, f: wp.array2d[stored], i: int, q: int, kind: int, term: float) -> float:
+        drho, j, _diagonal, _off = moments_at(f, at, i)
         u = j / (1.0 + drho)
-        source = cell_of(n, i) - t.c[q]
+        source = cell_of(at.n, i) - t.c[q]
         hold = float(1.0)
         for a in range(3):
-            if bounded[a] != 0:
+            if at.bounded[a] != 0:
                 if source[a] < 0:
                     u[a] = wp.min(u[a], 0.0)
-                    hold = wp.min(hold, HOLD / float(n[a]))
-                if source[a] >= n[a]:
+                    hold = wp.min(hold, HOLD / float(at.n[a]))
+                if source[a] >= at.n[a]:
                     u[a] = wp.max(u[a], 0.0)
-                    hold = wp.min(hold, HOLD / float(n[a]))
+                    hold = wp.min(hold, HOLD / float(at.n[a]))
         if kind != _OUTLET:
             drho += hold * (term - drho)
         return equilibrium(t.w[q], t.c[q], drho, u)
@@ -153,8 +156,7 @@ def link_kernels(lattice_name: str, storage: str, balance: bool) -> LinkKernels:
     def values(
         # in:
         t: Tables,
-        n: wp.vec3i,
-        bounded: wp.vec3i,
+        at: Layout,
         first: int,
         last: int,
         slab: int,
@@ -167,39 +169,40 @@ def link_kernels(lattice_name: str, storage: str, balance: bool) -> LinkKernels:
         # out:
         sums: wp.array1d[wp.float64],
     ):
-        at = first + wp.tid()
+        link = first + wp.tid()
         net = wp.float64(0.0)
         weight = wp.float64(0.0)
-        live = at < wp.min(last, links.used[0])
+        live = link < wp.min(last, links.used[0])
         if live:
-            i = links.cell[at]
-            q = int(links.code[at]) & 31
-            kind = int(links.code[at]) >> 5
+            i = links.cell[link]
+            q = int(links.code[link]) & 31
+            kind = int(links.code[link]) >> 5
             if solid.shape[0] > 0:
                 live = solid[i] == wp.uint8(0)
             if live:
-                out = load(f, opposite(q), i)
+                out = load(f, leaving(f, at, i, cell_of(at.n, i), opposite(q), -t.c[q]))
                 v = float(0.0)
                 if kind == _BOUNCE:
-                    v = out + links.term[at]
+                    v = out + links.term[link]
                 elif kind == _INLET or kind == _WIND:
                     # The larger of the two is the number of steps done; this value is for the next step.
                     risen = wp.min(1.0, float(wp.max(clock[0], clock[1]) + 1) * rise)
-                    term = links.term[at]
+                    term = links.term[link]
                     if kind == _WIND:
                         along = wp.vec3(float(t.c[q][0]), float(t.c[q][1]), float(t.c[q][2]))
                         term = 6.0 * t.w[q] * wp.dot(along, links.wind[0])
                     v = out + risen * risen * (3.0 - 2.0 * risen) * term
                 elif kind == _SLIP:
-                    k, c = mirrored(t, n, bounded, i, q)
+                    k, c = mirrored(t, at.n, at.bounded, i, q)
                     # A solid at the mirrored cell bounces the population back.
-                    v = load(f, t.index[9 * (c[0] + 1) + 3 * (c[1] + 1) + c[2] + 1], k)
+                    turned = t.index[9 * (c[0] + 1) + 3 * (c[1] + 1) + c[2] + 1]
+                    v = load(f, leaving(f, at, k, cell_of(at.n, k), turned, c))
                     if solid.shape[0] > 0:
                         if solid[k] != wp.uint8(0):
                             v = out
                 else:
-                    v = outflow(t, n, bounded, f, i, q, kind, links.term[at])
-                links.value[at] = v
+                    v = outflow(t, at, f, i, q, kind, links.term[link])
+                links.value[link] = v
                 net = wp.float64(v - out)
                 if kind == _OUTLET:
                     weight = wp.float64(t.w[q])
@@ -211,21 +214,21 @@ def link_kernels(lattice_name: str, storage: str, balance: bool) -> LinkKernels:
     def write(
         # in:
         t: Tables,
-        n: wp.vec3i,
+        at: Layout,
         first: int,
         links: Links,
         sums: wp.array1d[wp.float64],
         # out:
         f: wp.array2d[stored],
     ):
-        at = first + wp.tid()
-        if at >= links.used[0]:
+        link = first + wp.tid()
+        if link >= links.used[0]:
             return
-        i = links.cell[at]
-        q = int(links.code[at]) & 31
-        v = links.value[at]
+        i = links.cell[link]
+        q = int(links.code[link]) & 31
+        v = links.value[link]
         if wp.static(balance):
-            if int(links.code[at]) >> 5 == _OUTLET:
+            if int(links.code[link]) >> 5 == _OUTLET:
                 net = wp.float64(0.0)
                 weight = wp.float64(0.0)
                 for k in range(sums.shape[0] // 2):
@@ -233,71 +236,72 @@ def link_kernels(lattice_name: str, storage: str, balance: bool) -> LinkKernels:
                     weight += sums[2 * k + 1]
                 if weight > wp.float64(0.0):
                     v -= t.w[q] * float(net / weight)
-        store(f, q, index_of(n, wrapped(n, cell_of(n, i) - t.c[q])), v)
+        store(f, arriving(f, at, i, cell_of(at.n, i), q, t.c[q]), v)
 
     @wp.kernel(module="unique", module_options=options)
     def force(
         # in:
         t: Tables,
-        n: wp.vec3i,
-        bounded: wp.vec3i,
+        at: Layout,
         links: Links,
         solid: wp.array1d[wp.uint8],
         f: wp.array2d[stored],
         # out:
         total: wp.array1d[wp.vec3d],
     ):
-        at = wp.tid()
-        if at >= links.used[0]:
+        link = wp.tid()
+        if link >= links.used[0]:
             return
-        i = links.cell[at]
-        q = int(links.code[at]) & 31
+        i = links.cell[link]
+        q = int(links.code[link]) & 31
         c = t.c[q]
-        element = index_of(n, wrapped(n, cell_of(n, i) - c))
-        k = int(element)
-        if int(links.code[at]) >> 5 == _SLIP:
+        p = cell_of(at.n, i)
+        k = index_of(at.n, wrapped(at.n, p - c))
+        if int(links.code[link]) >> 5 == _SLIP:
             # Where a slip wall cuts a body, the mirror image of this link is a link of the body.
-            k, c = mirrored(t, n, bounded, i, q)
-        elif crosses(n, bounded, cell_of(n, i) - c):
+            k, c = mirrored(t, at.n, at.bounded, i, q)
+        elif crosses(at.n, at.bounded, p - c):
             return
         if solid[k] == wp.uint8(0) or solid[i] != wp.uint8(0):
             return
         # The element stores the population that came back; the one that went in is that minus the term.
-        exchanged = wp.float64(links.term[at] - 2.0 * load(f, q, element))
+        exchanged = wp.float64(links.term[link] - 2.0 * load(f, arriving(f, at, i, p, q, t.c[q])))
         along = wp.vec3d(wp.float64(c[0]), wp.float64(c[1]), wp.float64(c[2]))
         wp.atomic_add(total, int(solid[k]), exchanged * along)
 
     @wp.func
     def fill(
-        n: wp.vec3i,
-        bounded: wp.vec3i,
+        t: Tables,
+        at: Layout,
         stamp: wp.uint8,
         solid: wp.array1d[wp.uint8],
         fresh: wp.array1d[wp.uint8],
-        p: wp.vec3i,
+        i: int,
         f: wp.array2d[stored],
     ):
+        p = cell_of(at.n, i)
         total = wp.vec4()
         weight = float(0.0)
-        for q in range(1, wp.static(count)):
-            beside = p + wp.static(wp.vec3i(*c[q]))
-            k = index_of(n, wrapped(n, beside))
-            if not crosses(n, bounded, beside) and solid[k] == wp.uint8(0) and fresh[k] != stamp:
-                drho, j, _diagonal, _off = moments_at(f, k)
+        # These loops are not unrolled: few cells become fluid, and the code would take half a minute to compile.
+        for q in range(1, t.w.shape[0]):
+            beside = p + t.c[q]
+            k = index_of(at.n, wrapped(at.n, beside))
+            if not crosses(at.n, at.bounded, beside) and solid[k] == wp.uint8(0) and fresh[k] != stamp:
+                drho, j, _diagonal, _off = moments_at(f, at, k)
                 inverse = 1.0 / (1.0 + drho)
-                total += wp.static(w[q]) * wp.vec4(drho, inverse * j[0], inverse * j[1], inverse * j[2])
-                weight += wp.static(w[q])
+                total += t.w[q] * wp.vec4(drho, inverse * j[0], inverse * j[1], inverse * j[2])
+                weight += t.w[q]
         if weight > 0.0:
             total = total / weight
         u = wp.vec3(total[1], total[2], total[3])
-        for q in range(wp.static(count)):
-            store(f, q, index_of(n, p), equilibrium(wp.static(w[q]), wp.static(wp.vec3i(*c[q])), total[0], u))
+        for q in range(t.w.shape[0]):
+            store(f, leaving(f, at, i, p, q, t.c[q]), equilibrium(t.w[q], t.c[q], total[0], u))
 
     @wp.kernel(module="unique", module_options=options)
     def bounce(
         # in:
-        n: wp.vec3i,
-        bounded: wp.vec3i,
+        t: Tables,
+        at: Layout,
         window: Window,
         motion: Motion,
         stamp: wp.uint8,
@@ -313,21 +317,25 @@ def link_kernels(lattice_name: str, storage: str, balance: bool) -> LinkKernels:
         # A window may extend beyond the domain, on a periodic axis by one cell on the other side.
         live = wp.tid() < window.cells[0] * window.cells[1] * window.cells[2]
         for a in range(3):
-            live = live and place[a] >= -1 and place[a] <= n[a]
-        if live and not crosses(n, bounded, place):
-            p = wrapped(n, place)
-            i = index_of(n, p)
+            live = live and place[a] >= -1 and place[a] <= at.n[a]
+        if live and not crosses(at.n, at.bounded, place):
+            p = wrapped(at.n, place)
+            i = index_of(at.n, p)
             if solid[i] == wp.uint8(0):
                 if fresh[i] == stamp:
-                    fill(n, bounded, stamp, solid, fresh, p, f)
+                    fill(t, at, stamp, solid, fresh, i, f)
                 for q in range(1, wp.static(count)):
                     source = p - wp.static(wp.vec3i(*c[q]))
-                    k = index_of(n, wrapped(n, source))
-                    if not crosses(n, bounded, source) and int(solid[k]) == window.body:
+                    k = index_of(at.n, wrapped(at.n, source))
+                    if not crosses(at.n, at.bounded, source) and int(solid[k]) == window.body:
                         way = wp.static(wp.vec3(*map(float, c[q])))
                         u = wall_velocity(motion, window.body, centre_of(place) - 0.5 * way)
                         term = wp.static(6.0 * w[q]) * wp.dot(way, u)
-                        store(f, q, k, load(f, wp.static(((q - 1) ^ 1) + 1), i) + term)
+                        # What leaves towards the body and what arrives from it are in these two elements.
+                        here = element(f, wp.static(OPPOSITE[q]), i)
+                        there = element(f, q, k)
+                        left = wp.where(at.parity == 0, here, there)
+                        store(f, wp.where(at.parity == 0, there, here), load(f, left) + term)
                         net += wp.float64(term)
         if wp.static(balance):
             summed(wp.tid(), sums, 0, net)
@@ -387,7 +395,8 @@ def find_links(
 
 def bounce(
     kernels: LinkKernels,
-    bounded: wp.vec3i,
+    tables: Tables,
+    at: Layout,
     window: Window,
     motion: Motion,
     stamp: int,
@@ -399,7 +408,7 @@ def bounce(
     """Sends populations back from a moving body, after a step and before `apply`; arguments as there and for
     `lattice_bodies.mark`."""
     threads = -(-size_of(window) // BLOCK) * BLOCK
-    inputs = [window.n, bounded, window, motion, wp.uint8(stamp), solid, fresh, f]
+    inputs = [tables, at, window, motion, wp.uint8(stamp), solid, fresh, f]
     wp.launch(kernels.bounce, threads, inputs=inputs, outputs=[sums], block_dim=BLOCK, device=f.device)
 
 
@@ -409,8 +418,7 @@ def apply(
     slab: Slab,
     first: int,
     last: int,
-    n: wp.vec3i,
-    bounded: wp.vec3i,
+    at: Layout,
     links: Links,
     solid: wp.array,
     clock: wp.array,
@@ -427,8 +435,7 @@ def apply(
         tables: The velocity set, with Q velocities, on the slab's device.
         slab: The slab, one of P; only its device and its number matter.
         first, last: Its links are those from `first` to `last` - 1.
-        n: Cells along x, y and z; N in all.
-        bounded: 1 for each axis that is not periodic, else 0.
+        at: The domain of N cells, and the layout of `f`.
         links: The links; `value` is modified.
         solid: uint8 [N], number of the body of each cell, or [0] if no cell is solid.
         clock: int [2], see `lattice.step_kernel`.
@@ -442,8 +449,8 @@ def apply(
     if size <= 0:
         return
     if writing:
-        wp.launch(kernels.write, size, inputs=[tables, n, first, links, sums], outputs=[f], device=device)
+        wp.launch(kernels.write, size, inputs=[tables, at, first, links, sums], outputs=[f], device=device)
         return
     threads = -(-size // BLOCK) * BLOCK
-    inputs = [tables, n, bounded, first, last, slab.number, solid, clock, rise, f, links]
+    inputs = [tables, at, first, last, slab.number, solid, clock, rise, f, links]
     wp.launch(kernels.values, threads, inputs=inputs, outputs=[sums], block_dim=BLOCK, device=device)

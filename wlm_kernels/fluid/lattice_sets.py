@@ -11,6 +11,7 @@ would otherwise round to 1e-7 at every step and 16 bits could not represent.
 
 import functools
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,6 +21,9 @@ HALF_SCALE = 32768.0
 """Factor of 16-bit populations: their range is +-2, and 1.9e-9 the smallest value with all 11 bits."""
 
 STORAGES = {"float32": (wp.float32, 1.0), "float16": (wp.float16, HALF_SCALE)}
+
+OPPOSITE = (0, *(((q - 1) ^ 1) + 1 for q in range(1, 27)))
+"""The number of the opposite of each velocity."""
 
 PAIRS = ((0, 1), (0, 2), (1, 2))
 """The pairs of axes of the off-diagonal components xy, xz and yz."""
@@ -129,9 +133,14 @@ def index_of(n: wp.vec3i, p: wp.vec3i) -> int:
 
 
 @wp.func
+def _around(x: int, n: int) -> int:
+    return wp.where(x < 0, x + n, wp.where(x >= n, x - n, x))
+
+
+@wp.func
 def wrapped(n: wp.vec3i, p: wp.vec3i) -> wp.vec3i:
     """Returns the periodic image within the domain of a cell that is at most one cell outside."""
-    return wp.vec3i((p[0] + n[0]) % n[0], (p[1] + n[1]) % n[1], (p[2] + n[2]) % n[2])
+    return wp.vec3i(_around(p[0], n[0]), _around(p[1], n[1]), _around(p[2], n[2]))
 
 
 @wp.func
@@ -144,12 +153,6 @@ def crosses(n: wp.vec3i, bounded: wp.vec3i, p: wp.vec3i) -> bool:
 
 
 @wp.func
-def owned(n: wp.vec3i, bounded: wp.vec3i, walled: wp.vec3i, p: wp.vec3i) -> bool:
-    """Tests whether a population that leaves a cell towards cell p is stored; else a face's boundary writes there."""
-    return crosses(n, walled, p) or not crosses(n, bounded, p)
-
-
-@wp.func
 def equilibrium(w: float, c: wp.vec3i, drho: float, u: wp.vec3) -> float:
     """Computes f_eq - w: the second-order equilibrium population of a velocity c, minus the velocity's weight w.
 
@@ -157,6 +160,31 @@ def equilibrium(w: float, c: wp.vec3i, drho: float, u: wp.vec3) -> float:
     """
     cu = wp.dot(wp.vec3(float(c[0]), float(c[1]), float(c[2])), u)
     return w * (drho + (1.0 + drho) * (3.0 * cu + 4.5 * cu * cu - 1.5 * wp.dot(u, u)))
+
+
+@wp.struct
+class Layout:
+    """A domain, and where its populations are in memory, see `MemoryFunctions`: `n`, cells along x, y and z; `bounded`,
+    1 for each axis that is not periodic; `walled`, 1 for each axis that walls at rest close at both ends; `parity`."""
+
+    n: wp.vec3i
+    bounded: wp.vec3i
+    walled: wp.vec3i
+    parity: int
+
+
+def make_layout(shape: Sequence[int], bounded: Sequence[int], walls: Sequence[bool], parity: int) -> Layout:
+    """Makes the layout of a domain of `shape` cells; for the others see `Layout`."""
+    layout = Layout()
+    layout.n, layout.bounded, layout.parity = wp.vec3i(*shape), wp.vec3i(*bounded), parity
+    layout.walled = wp.vec3i(*map(int, walls))
+    return layout
+
+
+@wp.func
+def owned(at: Layout, p: wp.vec3i) -> bool:
+    """Tests whether a population that leaves a cell towards cell p is stored; else a face's boundary writes there."""
+    return crosses(at.n, at.walled, p) or not crosses(at.n, at.bounded, p)
 
 
 NARROW = 2**31 - 1
@@ -167,20 +195,35 @@ NARROW = 2**31 - 1
 class MemoryFunctions:
     """`wp.func`s that read and write populations in memory, for one lattice of Q velocities and one storage type.
 
+    Between two steps, an array of populations, [Q, N], has parity 0 or 1. With parity 0, element (q, k) is the
+    population q that has left cell k. With parity 1, it is the population of the opposite direction that arrives at
+    cell k next. At a wall at rest that closes a whole axis, the population q that leaves cell k is the one that arrives
+    there, so that its element is (q, k) with both parities.
+
+    The elements from which a cell reads what arrives are thus, with the other parity, those of what leaves the same
+    cell in the opposite directions. So a step writes where it has read, and needs one array (the AA pattern: Bailey et
+    al., "Accelerating lattice Boltzmann fluid flow simulations using graphics processors", 2009).
+
     Attributes:
         vec: vec of Q floats.
-        gather: (f, n, p) -> scaled vec, the populations that arrive at cell p: each is read from the cell that it left,
-            or from cell p itself at a wall at rest that closes a whole axis.
+        gather: (f, n, walled, i, parity) -> scaled vec, the populations that arrive at cell i.
+        scatter: (f, n, walled, i, parity, scaled vec), writes the populations that leave cell i; the parity is that of
+            f after.
         moments: scaled vec -> rho - 1, momentum, the diagonal and the off-diagonal (xy, xz, yz) of sum_q c c (f - w).
-        put: (f, q, i, value), writes a number that is already scaled.
-        load: (f, q, i) -> float, reads a number and removes the scale.
-        store: (f, q, i, value), scales and writes a number.
+        element: (f, q, i) -> element (q, i).
+        arriving: (f, layout, i, p, q, c_q) -> element of the population q that arrives at cell i, which is at p.
+        leaving: (f, layout, i, p, q, c_q) -> element of the population q that has left cell i.
+        load: (f, element) -> float, reads a number and removes the scale.
+        store: (f, element, value), scales and writes a number.
     """
 
     vec: Any
     gather: Any
+    scatter: Any
     moments: Any
-    put: Any
+    element: Any
+    arriving: Any
+    leaving: Any
     load: Any
     store: Any
 
@@ -200,6 +243,7 @@ def memory_functions(
     stored, scale = STORAGES[storage]
     vec = wp.types.vector(count, float)
     index_type = wp.int64 if wide else wp.int32
+    elements = wp.types.vector(count, index_type)
 
     # Elements are read through the pointer: addresses from Warp's 64-bit strides would take half the time of a step.
 
@@ -210,39 +254,52 @@ def memory_functions(
     def poke(f: wp.array2d[stored], k: index_type, value: stored): ...
 
     @wp.func
-    def element_of(f: wp.array2d[stored], q: int, i: int) -> index_type:
+    def element(f: wp.array2d[stored], q: int, i: int) -> index_type:
         return index_type(q) * index_type(f.shape[1]) + index_type(i)
 
     @wp.func
-    def load(f: wp.array2d[stored], q: int, i: int) -> float:
-        return float(peek(f, element_of(f, q, i))) * wp.static(1.0 / scale)
+    def load(f: wp.array2d[stored], k: index_type) -> float:
+        return float(peek(f, k)) * wp.static(1.0 / scale)
 
     @wp.func
-    def put(f: wp.array2d[stored], q: int, i: int, value: float):
-        poke(f, element_of(f, q, i), f.dtype(value))
+    def store(f: wp.array2d[stored], k: index_type, value: float):
+        poke(f, k, f.dtype(value * wp.static(scale)))
 
     @wp.func
-    def store(f: wp.array2d[stored], q: int, i: int, value: float):
-        put(f, q, i, value * wp.static(scale))
+    def arriving(f: wp.array2d[stored], at: Layout, i: int, p: wp.vec3i, q: int, c_q: wp.vec3i) -> index_type:
+        if at.parity != 0:
+            return element(f, opposite(q), i)
+        if crosses(at.n, at.walled, p - c_q):
+            return element(f, opposite(q), i)
+        return element(f, q, index_of(at.n, wrapped(at.n, p - c_q)))
 
     @wp.func
-    def gather(f: wp.array2d[stored], n: wp.vec3i, p: wp.vec3i) -> vec:
+    def leaving(f: wp.array2d[stored], at: Layout, i: int, p: wp.vec3i, q: int, c_q: wp.vec3i) -> index_type:
+        if at.parity == 0:
+            return element(f, q, i)
+        if crosses(at.n, at.walled, p + c_q):
+            return element(f, q, i)
+        return element(f, opposite(q), index_of(at.n, wrapped(at.n, p + c_q)))
+
+    @wp.func
+    def sources(f: wp.array2d[stored], n: wp.vec3i, walled: wp.vec3i, i: int) -> elements:
+        """Returns the elements of the populations that arrive at cell i in an array of parity 0."""
+        p = cell_of(n, i)
         x = wp.vec3i(wp.where(p[0] == 0, n[0], p[0]) - 1, p[0], wp.where(p[0] == n[0] - 1, 0, p[0] + 1))
         y = wp.vec3i(wp.where(p[1] == 0, n[1], p[1]) - 1, p[1], wp.where(p[1] == n[1] - 1, 0, p[1] + 1))
         z = wp.vec3i(wp.where(p[2] == 0, n[2], p[2]) - 1, p[2], wp.where(p[2] == n[2] - 1, 0, p[2] + 1))
-        i = index_of(n, p)
         # Warp's hash of a function excludes `wp.static` expressions of loop variables: without these constants a gather
         # with other walls would have the same hash, and would be loaded instead.
         closed = wp.vec3i(wp.static(int(walls[0])), wp.static(int(walls[1])), wp.static(int(walls[2])))
         low = wp.vec3i()
         high = wp.vec3i()
         for a in range(3):
-            low[a] = wp.where(p[a] == 0, closed[a], 0)
-            high[a] = wp.where(p[a] == n[a] - 1, closed[a], 0)
-        g = vec()
+            low[a] = wp.where(p[a] == 0, closed[a] * walled[a], 0)
+            high[a] = wp.where(p[a] == n[a] - 1, closed[a] * walled[a], 0)
+        out = elements()
         for q in range(wp.static(count)):
             row = x[wp.static(1 - c[q][0])] * n[1] + y[wp.static(1 - c[q][1])]
-            k = element_of(f, q, row * n[2] + z[wp.static(1 - c[q][2])])
+            k = element(f, q, row * n[2] + z[wp.static(1 - c[q][2])])
             if wp.static(any(walls[a] and c[q][a] != 0 for a in range(3))):
                 # Half-way bounce-back needs no branch: it reads another element.
                 back = bool(False)
@@ -251,9 +308,31 @@ def memory_functions(
                         back = back or low[a] != 0
                     if wp.static(walls[a] and c[q][a] < 0):
                         back = back or high[a] != 0
-                k = wp.where(back, element_of(f, wp.static(((q - 1) ^ 1) + 1), i), k)
-            g[q] = float(peek(f, k))
+                k = wp.where(back, element(f, wp.static(OPPOSITE[q]), i), k)
+            out[q] = k
+        return out
+
+    @wp.func
+    def gather(f: wp.array2d[stored], n: wp.vec3i, walled: wp.vec3i, i: int, parity: int) -> vec:
+        g = vec()
+        if parity == 0:
+            k = sources(f, n, walled, i)
+            for q in range(wp.static(count)):
+                g[q] = float(peek(f, k[q]))
+        else:
+            for q in range(wp.static(count)):
+                g[q] = float(peek(f, element(f, wp.static(OPPOSITE[q]), i)))
         return g
+
+    @wp.func
+    def scatter(f: wp.array2d[stored], n: wp.vec3i, walled: wp.vec3i, i: int, parity: int, left: vec):
+        if parity == 0:
+            for q in range(wp.static(count)):
+                poke(f, element(f, q, i), f.dtype(left[q]))
+        else:
+            k = sources(f, n, walled, i)
+            for q in range(wp.static(count)):
+                poke(f, k[wp.static(OPPOSITE[q])], f.dtype(left[q]))
 
     @wp.func
     def moments(g: vec):
@@ -272,4 +351,4 @@ def memory_functions(
         unit = wp.static(1.0 / scale)
         return unit * drho, unit * momentum, unit * diagonal, unit * off
 
-    return MemoryFunctions(vec, gather, moments, put, load, store)
+    return MemoryFunctions(vec, gather, scatter, moments, element, arriving, leaving, load, store)

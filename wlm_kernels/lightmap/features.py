@@ -174,30 +174,24 @@ def draw_sample(batch: Batch, n: int, b: int, samples: int) -> Sample:
 
 
 @wp.func
+def power(colour: wp.vec3, exponent: float) -> wp.vec3:
+    return wp.vec3(wp.pow(colour[0], exponent), wp.pow(colour[1], exponent), wp.pow(colour[2], exponent))
+
+
+@wp.func
 def texel_weight(batch: Batch, n: int, k: int, target: wp.vec3) -> wp.vec3:
     weight = batch.weight[n, k]
     if batch.emphasis == 0.0:
         return weight
     colour = batch.shift[n] + wp.cw_mul(batch.spread[n], target)
     least = 0.02  # keeps black texels in the fit
-    return wp.cw_mul(
-        weight,
-        wp.vec3(
-            wp.pow(wp.max(colour[0], least), batch.emphasis),
-            wp.pow(wp.max(colour[1], least), batch.emphasis),
-            wp.pow(wp.max(colour[2], least), batch.emphasis),
-        ),
-    )
+    return wp.cw_mul(weight, power(wp.max(colour, wp.vec3(least)), batch.emphasis))
 
 
 @wp.func
 def radiance_of(batch: Batch, n: int, k: int, y: wp.vec3) -> wp.vec3:
     c = wp.cw_mul(batch.shift[n] + wp.cw_mul(batch.spread[n], y), batch.scale[n, k])
-    return wp.vec3(
-        wp.pow(wp.max(c[0], 0.0), batch.gamma),
-        wp.pow(wp.max(c[1], 0.0), batch.gamma),
-        wp.pow(wp.max(c[2], 0.0), batch.gamma),
-    )
+    return power(wp.max(c, wp.vec3()), batch.gamma)
 
 
 @wp.func

@@ -7,6 +7,8 @@ high half of a block's 16 little-endian bytes. `wlm.formats.bc7` defines and des
 
 import warp as wp
 
+from wlm_kernels.lightmap.features import power
+
 wp.set_module_options({"enable_backward": False})
 
 
@@ -150,11 +152,6 @@ def frame_colour(stored: StoredFrames, frame: int, y: int, x: int) -> wp.vec3:
     high = stored.blocks[frame, y // 4, x // 4, 1]
     level = block_texel(low, high, stored.tables, 4 * (y % 4) + x % 4) / 255.0
     return stored.least[frame] + wp.cw_mul(level, stored.span[frame])
-
-
-@wp.func
-def power(colour: wp.vec3, exponent: float) -> wp.vec3:
-    return wp.vec3(wp.pow(colour[0], exponent), wp.pow(colour[1], exponent), wp.pow(colour[2], exponent))
 
 
 @wp.func

@@ -141,15 +141,13 @@ class MapTiles(DeviceTiles):
         self.arguments = (stored, hidden, output)
         self.device_bytes = sum(array.capacity for array in (*maps.values(), hidden, output))
 
-    def state(self, time: float, state: decode_kernels.TimeState | None = None) -> decode_kernels.TimeState:
-        """Returns a time's position, encoding and tile scales for the decode kernels, in `state` unless it is None."""
+    def state(self, time: float) -> decode_kernels.TimeState:
+        """Returns a time's position, encoding and tile scales for the decode kernel."""
         before, after, share = self._axis.neighbours(time)
-        if state is None:
-            state = decode_kernels.TimeState()
-            state.gamma, state.shift, state.spread = self.model.profile.gamma, self._shift, self._spread
-            state.scale = wp.empty_like(self._shift)
         scale = (1.0 - share) * self._scale[:, before] + share * self._scale[:, after]
-        state.scale.assign(scale.astype(np.float32))
+        state = decode_kernels.TimeState()
+        state.gamma, state.shift, state.spread = self.model.profile.gamma, self._shift, self._spread
+        state.scale = wp.array(scale.astype(np.float32), dtype=wp.vec3, device=self._device)
         state.tau, state.encoding = self._axis.place(time), wp.vec4(*self._axis.encode(time))
         return state
 
