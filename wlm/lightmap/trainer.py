@@ -334,12 +334,11 @@ class Trainer:
                 # A second thread of torch would spin between its calls, on the core that a lane needs.
                 torch.set_num_threads(1)
             with interop.stream(self.device):
-                # Steps keep the maps' levels up to date from here on.
-                self._round()
+                first_quantised = max(step, self._quantised_from)
                 while step < end:
                     stage, last = self.stage(step), step + _REPEATS
-                    if step == self._quantised_from:
-                        self._round()
+                    if step == first_quantised:
+                        self._round()  # each step of quantised maps does it for the next one
                     if self._cuda and last <= end and self.stage(last - 1) == stage:
                         self._repeated[stage]()
                         step = last

@@ -57,7 +57,8 @@ def ste_byte(v: float, quantised: int) -> float:
 
 
 @wp.func
-def ste_byte2(v: wp.vec2, quantised: int) -> wp.vec2:
+def level_at(plane: wp.array3d[wp.vec2], n: int, t: int, x: int, quantised: int) -> wp.vec2:
+    v = two_at(plane, n, t, x)
     return wp.vec2(ste_byte(v[0], quantised), ste_byte(v[1], quantised))
 
 
@@ -73,12 +74,8 @@ def plane_at(plane: wp.array3d[wp.vec2], n: int, p: float, tau: float, periodic:
     xb = axis_index(x + 1, columns, 0)
     ta = axis_index(t, rows, periodic)
     tb = axis_index(t + 1, rows, periodic)
-    early = (1.0 - fx) * ste_byte2(two_at(plane, n, ta, xa), quantised) + fx * ste_byte2(
-        two_at(plane, n, ta, xb), quantised
-    )
-    late = (1.0 - fx) * ste_byte2(two_at(plane, n, tb, xa), quantised) + fx * ste_byte2(
-        two_at(plane, n, tb, xb), quantised
-    )
+    early = (1.0 - fx) * level_at(plane, n, ta, xa, quantised) + fx * level_at(plane, n, ta, xb, quantised)
+    late = (1.0 - fx) * level_at(plane, n, tb, xa, quantised) + fx * level_at(plane, n, tb, xb, quantised)
     return (1.0 - ft) * early + ft * late
 
 
