@@ -10,7 +10,7 @@ from reference.levels import put_on_levels
 
 from kernels.compare import array, close
 from kernels.stepping import Case, fused_step, trainer
-from wlm_kernels.lightmap import features, gather, levels, wide
+from wlm_kernels.lightmap import features, gather, levels
 
 RATES = {"map_rate": 0.02, "net_rate": 0.005, "final_rate": 0.1}
 
@@ -76,16 +76,13 @@ def test_integer_sums_are_those_of_floats(device: str):
     """A GPU's sums of the maps, in steps of 2^-40, wherever they are updated."""
     random, results = np.random.default_rng(0), []
     values, sums = random.uniform(-0.2, 1.2, 48).astype(np.float32), random.normal(size=48).astype(np.float32)
-    rates, control = array(np.array([0.02, 0.01, 10.0, 10.0], np.float32), float, device), array([0], int, device)
+    rates, control = array(np.array([[0.02, 0.01, 10.0, 10.0]], np.float32), wp.vec4, device), array([0], int, device)
     none = [wp.zeros((1, 0), dtype=float, device=device), gather.Adam(), wp.zeros(0, dtype=float, device=device)]
-    for four, stored in ((wp.vec4, sums), (wide.vec4l, np.round(sums * 2.0**40).astype(np.int64))):
-        adam, offsets = gather.AdamOfFours(), features.Offsets()
-        maps, adam.first, adam.second = (
-            array(each.reshape(-1, 4), wp.vec4, device) for each in (values, 0 * values, 0 * values)
-        )
+    for scalar, stored in ((float, sums), (wp.int64, np.round(sums * 2.0**40).astype(np.int64))):
+        adam, maps, acc = gather.Adam(), array(values, float, device), array(stored[None], scalar, device)
         adam.decay, adam.epsilon = wp.vec2(0.9, 0.99), 1e-8
-        acc = array(stored.reshape(1, -1, 4), four, device)
-        gather.update(rates, offsets, acc, adam, maps, *none, *none, none[0], none[2], control, maps)
+        adam.first, adam.second = (array(np.zeros_like(values), float, device) for _ in range(2))
+        gather.update(rates, features.Offsets(), acc, adam, maps, *none, *none, none[0], none[2], control, maps)
         results.append([maps.numpy(), adam.first.numpy(), adam.second.numpy()])
         assert not acc.numpy().any()
     for floats, integers in zip(*results, strict=True):

@@ -21,7 +21,7 @@ from wlm.lightmap.group_scores import SumScore, score_sums
 from wlm.lightmap.held_out import HeldOut, score_held_out, stored_part
 from wlm.lightmap.model import LightmapModel, SheetModel
 from wlm.lightmap.sheet import Sheet, first_light
-from wlm.lightmap.tiles import TILE, TileGrid, TileKind
+from wlm.lightmap.tiles import TILE, TileKind
 from wlm.lightmap.view_scores import VIEWS, ShownScore, Tally, views_of
 from wlm.metrics import BRIGHTER, METRICS, FrameMetrics, LostLight, Summary, evaluate_frame, summarise
 from wlm.system import Meter, OnProgress
@@ -249,14 +249,12 @@ def _lost_light(model: SheetModel, lightmaps: SheetFrames, device: str) -> list[
     # Torch's threads would take longer to begin than a tile's numbers take.
     torch.set_num_threads(1)
     try:
-        looks = each(
-            lambda i: _doubtful(model.grid, lightmaps.frames[i], mask & lightmaps.valid(i)), range(len(model.times))
-        )
+        looks = each(lambda i: _doubtful(lightmaps.frames[i], mask & lightmaps.valid(i)), range(len(model.times)))
         for i, (doubtful, stamp) in enumerate(zip(looks, model.times, strict=True)):
-            chosen = [at for at in _windows(model) if at[0] in doubtful]
-            for start in range(0, len(chosen), _TILES_AT_ONCE):
-                decoder, some = decoder or SheetDecoder(model, device), chosen[start : start + _TILES_AT_ONCE]
-                for (tile, window), decoded in zip(some, decoder.tiles([tile for tile, _ in some], stamp), strict=True):
+            for start in range(0, len(doubtful), _TILES_AT_ONCE):
+                decoder, some = decoder or SheetDecoder(model, device), doubtful[start : start + _TILES_AT_ONCE]
+                for tile, decoded in zip(some, decoder.tiles(some, stamp), strict=True):
+                    window = model.grid.window(tile)
                     valid = mask[window] & lightmaps.valid(i)[window]
                     inner = decoded[: valid.shape[0], : valid.shape[1]][valid]
                     lost.add(lightmaps.frames[i][window][valid], inner, _place(tile, stamp))
@@ -265,25 +263,21 @@ def _lost_light(model: SheetModel, lightmaps: SheetFrames, device: str) -> list[
     return lost.warnings(model.name, *_LOST)
 
 
-def _doubtful(grid: TileGrid, frame: np.ndarray, valid: np.ndarray) -> set[int]:
+def _doubtful(frame: np.ndarray, valid: np.ndarray) -> list[int]:
     """Returns the tiles of a frame [H, W, 3] with valid texels, bool [H, W], in which PSNR may hide lost light."""
-    found: set[int] = set()
-    for row in range(grid.rows):
-        strip = slice(row * TILE, (row + 1) * TILE)
-        inside, colour = valid[strip], frame[strip]
-        light = np.maximum(np.maximum(colour[..., 0], colour[..., 1]), colour[..., 2]) * inside
-        starts = np.arange(0, grid.width, TILE)
-
-        def count(texels: np.ndarray, starts: np.ndarray = starts) -> np.ndarray:
-            return np.add.reduceat(texels.sum(0, dtype=np.int32), starts)
-
+    found: list[int] = []
+    width = valid.shape[1]
+    starts = np.arange(0, width, TILE)
+    for row in range(0, len(valid), TILE):
+        inside, light = valid[row : row + TILE], frame[row : row + TILE]
+        light = np.maximum(np.maximum(light[..., 0], light[..., 1]), light[..., 2]) * inside
         largest = np.maximum.reduceat(light.max(0), starts)
-        most = np.repeat(largest, TILE)[: grid.width]
-        few = count(2.0 * light >= most) <= _FEW_TEXELS
-        texels, dark = count(inside), count((BRIGHTER * light < most) & inside)
-        # Half of the texels are dark where the median is.
-        chosen = (largest > 0) & (few & (texels > _FEW_TEXELS) | (2 * dark >= texels))
-        found.update((row * grid.cols + np.flatnonzero(chosen)).tolist())
+        most = np.repeat(largest, TILE)[:width]
+        marks = np.stack([inside, 2.0 * light >= most, inside & (BRIGHTER * light < most)])
+        texels, few, dark = np.add.reduceat(marks.sum(1, dtype=np.int32), starts, axis=1)
+        # Where half of the texels are dark, the median is.
+        chosen = (largest > 0) & ((few <= _FEW_TEXELS) & (texels > _FEW_TEXELS) | (2 * dark >= texels))
+        found += (row // TILE * len(starts) + np.flatnonzero(chosen)).tolist()
     return found
 
 

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import numpy as np
 import torch
@@ -20,7 +19,7 @@ from wlm.formats.parts import Part, check_part, check_parts
 from wlm.lightmap.profile import Profile, TimeAxis, encode_time
 from wlm.lightmap.tiles import TILE, TileCut
 from wlm.workers import each
-from wlm_kernels.lightmap import blocks, features, gather, levels, wide
+from wlm_kernels.lightmap import blocks, features, gather, levels
 from wlm_kernels.lightmap import step as lightmap_step
 from wlm_kernels.lightmap.features import INPUTS
 
@@ -217,6 +216,7 @@ class Trainer:
         self._tracked = zeros(lanes if self._track else 0, n, len(self.axis.times), 2)
         self._rates, self._moments = zeros(4), {}
         named = {"maps": self.maps, "hidden": self.hidden, "output": self.output}
+        self._wrapped_rates = interop.to_warp(self._rates.view(1, 4), wp.vec4)
         adams = [self._moments_of(*item) for item in named.items()]
 
         vec, wrap = self._kernels.net.vec_hidden, interop.to_warp
@@ -237,25 +237,21 @@ class Trainer:
             wrap(self._partial_out.view(parts, -1)),
             wrap(self._loss_parts),
         )
-        fours = wrap(self._acc.view(lanes, -1, 4), wide.vec4l if self._cuda else wp.vec4)
         # The arguments of `gather.update`.
-        arguments: list = [wrap(self._rates), self._offsets, fours, adams[0], wrap(self.maps.view(-1, 4), wp.vec4)]
+        self._update_args: list = [self._wrapped_rates, self._offsets, self._launch_sums[0], adams[0], wrap(self.maps)]
         for sums, moments, values in zip(net_sums, adams[1:], nets, strict=False):
-            arguments += [sums, moments, wrap(values.view(-1))]
-        arguments += [net_sums[2], wrap(self.loss), wrap(self.control), wrap(rounded.view(-1, 4), wp.vec4)]
-        self._update_args = arguments
+            self._update_args += [sums, moments, wrap(values.view(-1))]
+        self._update_args += [net_sums[2], wrap(self.loss), wrap(self.control), wrap(rounded)]
 
-    def _moments_of(self, name: str, values: torch.Tensor) -> Any:
+    def _moments_of(self, name: str, values: torch.Tensor) -> gather.Adam:
         """Returns the state of the optimiser (Adam) for one array of parameters, with all moments 0."""
-        fours = name == "maps"
-        adam = gather.AdamOfFours() if fours else gather.Adam()
+        adam = gather.Adam()
         adam.decay = wp.vec2(_MOMENTUM, self._decay)
         adam.epsilon = _ADAM_EPSILON
         for key, field in (("exp_avg", "first"), ("exp_avg_sq", "second")):
             moments = torch.zeros(values.numel(), device=self.device)
             self._moments[f"adam_{name}.{key}"] = moments
-            wrapped = interop.to_warp(moments.view(-1, 4), wp.vec4) if fours else interop.to_warp(moments)
-            setattr(adam, field, wrapped)
+            setattr(adam, field, interop.to_warp(moments))
         return adam
 
     def _upload(self, targets: Targets, seed: int, gamma: float, slices: int) -> None:
@@ -286,16 +282,17 @@ class Trainer:
         batch.emphasis = targets.emphasis
         batch.periodic = int(self.axis.periodic)
         batch.quantised = batch.frozen = 0
-        batch.first_rates, batch.rates = wp.vec2(*self._first_rates), interop.to_warp(self._rates)
+        batch.rates = self._wrapped_rates
         self.batch = batch
 
     def _rates_over_steps(self, final_rate: float) -> wp.array:
-        """Returns the learning rate and Adam's two bias corrections of each step, vec3 [steps]."""
+        """Returns the rates of maps and networks and Adam's two bias corrections at each step, vec4 [steps]."""
         share = np.linspace(0.0, 1.0, self.steps)
         values = final_rate + (1.0 - final_rate) * 0.5 * (1.0 + np.cos(np.pi * share))
         done = np.arange(1, self.steps + 1)
         corrections = 1.0 / (1.0 - _MOMENTUM**done), 1.0 / np.sqrt(1.0 - self._decay**done)
-        return wp.array(np.stack([values, *corrections], 1).astype(np.float32), dtype=wp.vec3, device=self.device)
+        rates = (np.float32(rate) * values.astype(np.float32) for rate in self._first_rates)
+        return wp.array(np.stack([*rates, *corrections], 1).astype(np.float32), dtype=wp.vec4, device=self.device)
 
     def _draw(self, seed: int) -> None:
         """Draws random initial parameters. Each tile has its own generator, so that batching does not change them."""

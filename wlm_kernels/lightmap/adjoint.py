@@ -12,9 +12,8 @@ from typing import Any
 import warp as wp
 
 from wlm_kernels.interpolate import axis_index, cell, fraction
-from wlm_kernels.lightmap.blocks import ste_endpoint, ste_weight
+from wlm_kernels.lightmap.blocks import endpoint_at, ste_endpoint, ste_weight
 from wlm_kernels.lightmap.features import Maps, Offsets
-from wlm_kernels.lightmap.wide import endpoint_at
 from wlm_kernels.native import native_source
 
 

@@ -15,7 +15,7 @@ times). Blocks of the file are `[S, H/4, W/4, 2]` of uint64, the low and the hig
 
 import warp as wp
 
-from wlm_kernels.lightmap.wide import endpoint_at
+from wlm_kernels.native import native_source
 
 wp.set_module_options({"enable_backward": False})
 
@@ -104,11 +104,15 @@ def ste_mix(e0: wp.vec4, e1: wp.vec4, w: float, quantised: int) -> wp.vec4:
     )
 
 
+@wp.func_native(native_source(__package__, "endpoint_at"))
+def endpoint_at(values: wp.array4d[wp.vec4], s: int, y: int, x: int, e: int) -> wp.vec4: ...
+
+
 @wp.func
 def texel(
     endpoints: wp.array4d[wp.vec4], weights: wp.array3d[float], s: int, y: int, x: int, quantised: int
 ) -> wp.vec4:
-    """Returns the texel (y, x) of slice s of a map in training, from its endpoints (see `wide`) and weights."""
+    """Returns the texel (y, x) of slice s of a map in training, from its endpoints and weights."""
     e0 = ste_endpoint(endpoint_at(endpoints, s, y // 4, x // 4, 0), quantised)
     e1 = ste_endpoint(endpoint_at(endpoints, s, y // 4, x // 4, 1), quantised)
     return ste_mix(e0, e1, ste_weight(weights[s, y, x], quantised), quantised)

@@ -15,7 +15,7 @@ import warp as wp
 
 from wlm_kernels.interpolate import axis_index, cell, fraction
 from wlm_kernels.lightmap.blocks import texel
-from wlm_kernels.lightmap.wide import two_at
+from wlm_kernels.native import native_source
 
 INPUTS, MAP_INPUTS = 16, 12
 """Inputs of a network, and those of them that come from the maps; the encoded time follows."""
@@ -56,9 +56,13 @@ def ste_byte(v: float, quantised: int) -> float:
     return wp.floor(c * 255.0 + 0.5) / 255.0
 
 
+@wp.func_native(native_source(__package__, "plane_texel"))
+def plane_texel(values: wp.array3d[wp.vec2], n: int, t: int, x: int) -> wp.vec2: ...
+
+
 @wp.func
 def level_at(plane: wp.array3d[wp.vec2], n: int, t: int, x: int, quantised: int) -> wp.vec2:
-    v = two_at(plane, n, t, x)
+    v = plane_texel(plane, n, t, x)
     return wp.vec2(ste_byte(v[0], quantised), ste_byte(v[1], quantised))
 
 
@@ -130,24 +134,13 @@ class Batch:
     periodic: int
     quantised: int  # as in `wlm_kernels.lightmap.blocks`
     frozen: int  # whether the maps get no gradients
-    first_rates: wp.vec2  # the initial learning rates of the maps and of the networks
-    schedule: wp.array1d[wp.vec3]  # [steps] factor on the learning rates, and Adam's two corrections, see `gather`
-    rates: wp.array1d[float]  # [4] the rates of maps and networks at this step and the corrections, written
+    schedule: wp.array1d[wp.vec4]  # [steps] learning rates of maps and networks, and Adam's two corrections
+    rates: wp.array1d[wp.vec4]  # [1] those of this step, written: the launch that uses them also counts the step
 
 
 @wp.func
 def draw_state(batch: Batch, n: int, b: int, samples: int) -> wp.uint32:
     return wp.rand_init(batch.seed + batch.number[n] * 9973, batch.control[0] * samples + b)
-
-
-@wp.func
-def write_rates(batch: Batch):
-    """Writes the rates of this step: the launch that uses them also counts the step and can't read its number."""
-    now = batch.schedule[wp.min(batch.control[0], batch.schedule.shape[0] - 1)]
-    batch.rates[0] = now[0] * batch.first_rates[0]
-    batch.rates[1] = now[0] * batch.first_rates[1]
-    batch.rates[2] = now[1]
-    batch.rates[3] = now[2]
 
 
 @wp.struct

@@ -9,7 +9,7 @@ import warp as wp
 
 from wlm_kernels.lightmap.blocks import ste_endpoint, ste_weight
 from wlm_kernels.lightmap.features import Offsets
-from wlm_kernels.lightmap.wide import four_at, put_four, take_four, vec4l
+from wlm_kernels.native import native_source
 
 wp.set_module_options({"enable_backward": False})
 
@@ -26,18 +26,28 @@ def _drain(sums: wp.array2d[float], i: int, clear: int) -> float:
     return s
 
 
-@wp.func
-def _drain_four(sums: wp.array2d[wp.vec4], i: int) -> wp.vec4:
-    s = wp.vec4()
-    for p in range(sums.shape[0]):
-        s += sums[p, i]
-        sums[p, i] = wp.vec4()
-    return s
+@wp.func_native(native_source(__package__, "four_at"))
+def _four_at(values: wp.array1d[float], i: int) -> wp.vec4: ...
+
+
+@wp.func_native(native_source(__package__, "put_four"))
+def _put_four(values: wp.array1d[float], i: int, v: wp.vec4): ...
+
+
+@wp.func_native(native_source(__package__, "take_four"))
+def _take_four(sums: wp.array2d[wp.int64], i: int) -> wp.vec4: ...
 
 
 @wp.func
-def _drain_four(sums: wp.array2d[vec4l], i: int) -> wp.vec4:
-    return take_four(sums, i) * 9.094947017729282e-13  # steps of 2^-40, as `adjoint` adds them
+def _drain_four(sums: wp.array2d[float], i: int) -> wp.vec4:
+    return wp.vec4(
+        _drain(sums, 4 * i, 1), _drain(sums, 4 * i + 1, 1), _drain(sums, 4 * i + 2, 1), _drain(sums, 4 * i + 3, 1)
+    )
+
+
+@wp.func
+def _drain_four(sums: wp.array2d[wp.int64], i: int) -> wp.vec4:
+    return _take_four(sums, i) * 9.094947017729282e-13  # steps of 2^-40, as `adjoint` adds them
 
 
 @wp.struct
@@ -48,16 +58,6 @@ class Adam:
     epsilon: float
     first: wp.array1d[float]
     second: wp.array1d[float]
-
-
-@wp.struct
-class AdamOfFours:
-    """`Adam` of an array whose parameters are updated four at a time."""
-
-    decay: wp.vec2
-    epsilon: float
-    first: wp.array1d[wp.vec4]
-    second: wp.array1d[wp.vec4]
 
 
 @wp.func
@@ -81,15 +81,15 @@ def _move(values: wp.array1d[float], adam: Adam, i: int, grad: float, rate: floa
 @wp.kernel
 def _update(
     # in:
-    rates: wp.array1d[float],
+    rates: wp.array1d[wp.vec4],
     offsets: Offsets,
     levels: int,
     base: int,
     clear: int,
     # in and out:
     acc: wp.array2d[Any],
-    adam: AdamOfFours,
-    maps: wp.array1d[wp.vec4],
+    adam: Adam,
+    maps: wp.array1d[float],
     partial: wp.array2d[float],
     adam_hidden: Adam,
     hidden: wp.array1d[float],
@@ -100,19 +100,20 @@ def _update(
     mean_loss: wp.array1d[float],
     control: wp.array1d[int],
     # out:
-    rounded: wp.array1d[wp.vec4],
+    rounded: wp.array1d[float],
 ):
     # Networks come first: their sums take longest.
     t = base + wp.tid()
-    corrections = wp.vec2(rates[2], rates[3])
+    now = rates[0]
+    corrections = wp.vec2(now[2], now[3])
     if t == 0:
         control[0] = control[0] + 1
     if t < hidden.shape[0]:
-        _move(hidden, adam_hidden, t, _drain(partial, t, clear), rates[1], corrections)
+        _move(hidden, adam_hidden, t, _drain(partial, t, clear), now[1], corrections)
         return
     t -= hidden.shape[0]
     if t < output.shape[0]:
-        _move(output, adam_out, t, _drain(partial_out, t, clear), rates[1], corrections)
+        _move(output, adam_out, t, _drain(partial_out, t, clear), now[1], corrections)
         return
     t -= output.shape[0]
     if t < mean_loss.shape[0]:
@@ -121,39 +122,39 @@ def _update(
         return
     t -= mean_loss.shape[0]
     # All reads come before the first write, for which they would wait.
-    value = four_at(maps, t)
-    first = four_at(adam.first, t)
-    second = four_at(adam.second, t)
+    value = _four_at(maps, t)
+    first = _four_at(adam.first, t)
+    second = _four_at(adam.second, t)
     grad = _drain_four(acc, t)
     for c in range(4):
         old = wp.vec3(wp.clamp(value[c], 0.0, 1.0), first[c], second[c])
-        new = _moved(old, grad[c], adam.decay, adam.epsilon, rates[0], corrections)
+        new = _moved(old, grad[c], adam.decay, adam.epsilon, now[0], corrections)
         value[c] = new[0]
         first[c] = new[1]
         second[c] = new[2]
-    put_four(maps, t, value)
-    put_four(adam.first, t, first)
-    put_four(adam.second, t, second)
+    _put_four(maps, t, value)
+    _put_four(adam.first, t, first)
+    _put_four(adam.second, t, second)
     at = 4 * t
     if levels != 0 and at < offsets.ut:
         if at < offsets.uv_weights or (at >= offsets.uvt_endpoints and at < offsets.uvt_weights):
-            put_four(rounded, t, ste_endpoint(value, 1))
+            _put_four(rounded, t, ste_endpoint(value, 1))
         else:
             for c in range(4):
                 value[c] = ste_weight(value[c], 1)
-            put_four(rounded, t, value)
+            _put_four(rounded, t, value)
 
 
 # Both forms are compiled with the module: the threads of a fit on the CPU would compile one at the same time.
-for _four in (wp.vec4, vec4l):
-    wp.overload(_update, {"acc": wp.array2d[_four]})
+for _scalar in (float, wp.int64):
+    wp.overload(_update, {"acc": wp.array2d[_scalar]})
 
 
 def update(
     rates: wp.array,
     offsets: Offsets,
     acc: wp.array,
-    adam: AdamOfFours,
+    adam: Adam,
     maps: wp.array,
     partial: wp.array,
     adam_hidden: Adam,
@@ -174,20 +175,19 @@ def update(
     """Converts sums into gradients, updates the parameters with Adam, and counts the step.
 
     Args:
-        rates, offsets: As `features.write_rates` writes them, and the positions of the maps in `maps`.
-        acc: The sums for the M parameters of the maps, as `StepKernels.launch` adds them, in fours [lanes, M / 4];
-            set to 0.
-        maps: vec4 [M / 4], the maps; clamped to [0, 1], then updated.
+        rates, offsets: As in `features.Batch`, and the positions of the maps in `maps`.
+        acc: The sums for the M parameters of the maps, as `StepKernels.launch` adds them; set to 0.
+        maps: float [M], the maps, M a multiple of 4; clamped to [0, 1], then updated.
         partial, partial_out, loss: Sums of P threads or blocks for hidden and output layers and losses, float [P, ...];
             set to 0 on the CPU, whose next step adds to them.
         adam, adam_hidden, adam_out, hidden, output: States of the optimisers and the layers, float, updated.
         mean_loss, control: float [N], running mean of each tile's loss; int [1], number of the step, increased by 1.
-        rounded: vec4, with `levels` written: the new endpoints and weights on the levels of the file, at their places.
+        rounded: float, with `levels` written: the new endpoints and weights on the levels of the file, at their places.
         frozen: Whether only the networks are updated.
         levels: Whether `rounded` is written.
         lane, lanes: This launch updates one of so many parts of all parameters; lane 0 counts the step.
     """
-    total = hidden.shape[0] + output.shape[0] + mean_loss.shape[0] + (0 if frozen else maps.shape[0])
+    total = hidden.shape[0] + output.shape[0] + mean_loss.shape[0] + (0 if frozen else maps.shape[0] // 4)
     span = -(-total // lanes)
     sums = [acc, adam, maps, partial, adam_hidden, hidden, partial_out, adam_out, output, loss, mean_loss, control]
     wp.launch(

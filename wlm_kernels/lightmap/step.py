@@ -34,7 +34,6 @@ from wlm_kernels.lightmap.features import (
     texel_weight,
     track_error,
     volume_at,
-    write_rates,
 )
 from wlm_kernels.lightmap.matrix_step import BLOCK, matrix_network
 
@@ -213,7 +212,7 @@ def step_kernels(hidden: int, gelu: str, device_kind: str) -> StepKernels:
             n, i = wp.tid()
             b = base + i
             if n == 0 and b == 0:
-                write_rates(batch)
+                batch.rates[0] = batch.schedule[wp.min(batch.control[0], batch.schedule.shape[0] - 1)]
             lane = wp.where(base == 0, 0, 1)
             sample = draw_sample(batch, n, b, samples)
             k = sample.k
@@ -264,7 +263,7 @@ def step_kernels(hidden: int, gelu: str, device_kind: str) -> StepKernels:
         ):
             n, b = wp.tid()
             if n == 0 and b == 0:
-                write_rates(batch)
+                batch.rates[0] = batch.schedule[wp.min(batch.control[0], batch.schedule.shape[0] - 1)]
             sample = draw_sample(batch, n, b, samples)
             k = sample.k
             f = features(maps, batch, n, sample.flat // 128, sample.flat % 128, k, sample.state)
