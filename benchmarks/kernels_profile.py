@@ -4,7 +4,8 @@ Nsight Compute (`ncu`) counts for each kernel of a case of `benchmarks.kernel_ca
 memory, the L2 cache and the issue of instructions are, as shares of their peaks, how many of the possible warps are
 active, the registers of a thread, and what a warp waits for. A row has the means over all launches of a kernel in one
 call, weighted by time; the note is the reason that follows from them. The `KERNELS` slowest kernels of a case have a
-row. Times are those under the profiler, with cold caches, and serve only as weights.
+row. Times are those under the profiler, and serve only as weights. Each metric is one counter: a "throughput" of many
+counters takes many replays of the kernel, and before each of them all memory that it writes is restored.
 """
 
 import csv
@@ -24,7 +25,7 @@ from wlm.errors import WlmError
 
 KERNELS = 3  # rows of a case
 _LAUNCHES = 250  # most launches of a case that are profiled
-_SECONDS = 120.0  # most time of a case
+_SECONDS = 60.0  # most time of a case
 _TIME = "gpu__time_duration.sum"
 _STALLS = {
     "long_scoreboard": "global memory",
@@ -42,9 +43,9 @@ _STALLS = {
     "drain": "stores at its end",
 }
 _FIGURES = {
-    "memory_busy": "gpu__dram_throughput.avg.pct_of_peak_sustained_elapsed",
-    "l2_busy": "lts__throughput.avg.pct_of_peak_sustained_elapsed",
-    "l1_busy": "l1tex__throughput.avg.pct_of_peak_sustained_active",
+    "memory_busy": "dram__bytes.sum.pct_of_peak_sustained_elapsed",
+    "l2_busy": "lts__t_sectors.sum.pct_of_peak_sustained_elapsed",
+    "l1_busy": "l1tex__data_pipe_lsu_wavefronts.sum.pct_of_peak_sustained_elapsed",
     "issue_busy": "smsp__issue_active.avg.pct_of_peak_sustained_active",
     "warps_active": "sm__warps_active.avg.pct_of_peak_sustained_active",
 }
@@ -132,7 +133,8 @@ def _reason(figures: Mapping[str, float], stalls: Mapping[str, float], registers
 def _profiled(ncu: str, name: str, device: str) -> list[dict[str, str]]:
     """Runs a case in a process of its own under the profiler, and returns its launches."""
     metrics = [_TIME, _REGISTERS, *_FIGURES.values(), *map(_column, _STALLS)]
-    command = [ncu, "--clock-control", "none", "--profile-from-start", "off", "--launch-count", str(_LAUNCHES)]
+    command = [ncu, "--clock-control", "none", "--cache-control", "none", "--profile-from-start", "off"]
+    command += ["--launch-count", str(_LAUNCHES)]
     command += ["--metrics", ",".join(metrics), "--csv", "--page", "raw", "--print-units", "base"]
     command += [sys.executable, "-m", "benchmarks.kernels_profile", name, device]
     try:

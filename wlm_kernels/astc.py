@@ -14,8 +14,8 @@ from wlm_kernels import block_lines as lines
 # Without fused operations every device writes the same bytes.
 wp.set_module_options({"enable_backward": False, "max_unroll": 1, "fuse_fp": False})
 
-_AXIS_ROUNDS = wp.constant(5)
-_REFITTED = wp.constant(2)  # number of refits of the best block's ends to its weights
+_AXIS_ROUNDS = wp.constant(3)
+_REFITTED = wp.constant(1)  # number of refits of the best block's ends to its weights
 _ALONG = wp.constant(0.2)  # what weights leave of the distances along a line
 _BASE_SCALE = wp.constant(7)  # endpoint mode whose ends differ by one factor
 

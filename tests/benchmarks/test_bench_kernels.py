@@ -81,7 +81,7 @@ def _launch(name, time, memory, stalls):
     row = defaultdict(
         str, {"Kernel Name": name, "gpu__time_duration.sum": f"{time:,}", "launch__registers_per_thread": "40"}
     )
-    row["gpu__dram_throughput.avg.pct_of_peak_sustained_elapsed"] = str(memory)
+    row["dram__bytes.sum.pct_of_peak_sustained_elapsed"] = str(memory)
     return row | {
         f"smsp__average_warps_issue_stalled_{key}_per_issue_active.ratio": str(v) for key, v in stalls.items()
     }

@@ -101,6 +101,7 @@ def test_bricks_are_the_smoke_of_all_cells(scheme: str, device: str):
     assert all((a == b).all() for a, b in zip(dense.bricks()[1], sparse.bricks()[1], strict=True))
     whole, part = (each.frame() for each in (dense, sparse))
     assert part.shape == whole.shape and part.places is not None and whole.places is None
+    assert part.density.data_ptr() == sparse.frame().density.data_ptr()
     assert torch.equal(torch.cat(list(part.slabs(part.temperature))), whole.temperature)
 
 

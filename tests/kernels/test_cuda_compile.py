@@ -82,7 +82,7 @@ def _smoke(dtype: type) -> list:
     """Builds all kernels that take smoke, for densities of one type."""
     smoke = smoke_march.smoke_struct(dtype, True)
     variants = {"_guide": (True,), "_coarse": (dtype is wp.float16,), "_measure": (2,)}
-    built = [smoke_march.occupied_kernel(dtype), smoke_path._coarser]
+    built = [smoke_march.occupied_kernel(dtype), smoke_path._coarser, *map(depth_lattice._add_up, BOTH)]
     for module in (marches, march_six, depth_lattice, diffusion, smoke_path):
         # Functions of Warp have a `build`, too.
         built_by = {name: value for name, value in vars(module).items() if not isinstance(value, wp.Function)}

@@ -49,6 +49,8 @@ def _flat(camera, transparency, light=0.0, device="cpu"):
 def test_bytes():
     assert to_bytes(torch.tensor([[0.0, 0.5, 1.0, 9.0]])).tolist() == [[[0] * 3, [188] * 3, [255] * 3, [255] * 3]]
     assert to_bytes(np.full((1, 1, 3), 2.0), 4.0).tolist() == [[[188] * 3]]
+    light = np.random.default_rng(0).random((256, 256, 3), np.float32) - 0.05
+    np.testing.assert_array_equal(to_bytes(torch.from_numpy(light), 0.9), to_bytes(light, 0.9))
 
 
 @pytest.mark.parametrize("perspective", [False, True])

@@ -40,7 +40,7 @@ def black_body_colour(kelvin: np.ndarray) -> np.ndarray:
 
 def black_body_light(kelvin: torch.Tensor) -> torch.Tensor:
     """Returns the luminance of black bodies relative to 1,500 K, at most 65,504, like `kelvin` in shape and type."""
-    table = torch.from_numpy(_lights()).to(kelvin.device)
+    table = _lights(kelvin.device)
     at = (1 / _COLD - 1 / kelvin.float().clamp(_COLD, _HOT)) * ((len(table) - 1) / (1 / _COLD - 1 / _HOT))
     first = at.long().clamp(max=len(table) - 2)
     light = torch.exp(torch.lerp(table[first], table[first + 1], at - first))
@@ -48,11 +48,12 @@ def black_body_light(kelvin: torch.Tensor) -> torch.Tensor:
 
 
 @functools.cache
-def _lights() -> np.ndarray:
-    """Returns the logarithm of the light of black bodies at equal steps of 1 / T, float32 [4096]."""
+def _lights(device: torch.device) -> torch.Tensor:
+    """Returns the logarithm of the light of black bodies at equal steps of 1 / T, float32 [4096]. It is kept, since a
+    CUDA graph cannot copy it to the GPU."""
     inverse = np.linspace(1 / _COLD, 1 / _HOT, 4 * _SAMPLES)
     light = black_body_luminance(1 / inverse) / black_body_luminance(np.array(GLOWING))
-    return np.log(np.maximum(light, 1e-30)).astype(np.float32)
+    return torch.from_numpy(np.log(np.maximum(light, 1e-30)).astype(np.float32)).to(device)
 
 
 @functools.cache

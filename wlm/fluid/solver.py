@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 import torch
 import warp as wp
-from torch.nn.functional import pad
 
 from wlm.errors import WlmError
 from wlm.fluid.bricks import INDEX_BYTES, BrickPool, require_memory
@@ -514,8 +513,7 @@ class Solver:
         cell: float = 1.0,
         origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
     ) -> DensityVolume:
-        """Returns the smoke as a volume. Without bricks it shares the solver's memory and is valid until the next step;
-        with bricks it is a copy of those that have smoke.
+        """Returns the smoke as a volume, which shares the solver's memory and is valid until the next step.
 
         Args:
             extinction: Extinction per length of the world at density 1.
@@ -524,16 +522,14 @@ class Solver:
             origin: Corner of the domain in the world.
         """
         where: dict[str, Any] = {"voxel": cell * self._box.voxel, "origin": origin}
-        if self._pool is None:
-            values = [wp.to_torch(part) for part in (self.density, self.temperature) if part is not None]
-        else:
-            numbers, values = self.bricks()
-            values = [pad(part, (0, 0) * 3 + (1, 0)) for part in values]
-            places = torch.zeros(math.prod(self._box.bricks), dtype=torch.int32, device=numbers.device)
-            places[numbers.long()] = torch.arange(1, len(numbers) + 1, dtype=torch.int32, device=numbers.device)
-            where |= {"places": places.view(*self._box.bricks), "cells": self.shape}
-        heat = values[1] if self._grids["temperature"] else None
-        return DensityVolume(values[0], extinction, temperature=heat, emission=emission, **where)
+        shape = self.shape
+        if self._pool is not None:
+            shape = (-1, *[advection_places.BRICK] * 3)
+            places = wp.to_torch(self._bricks.places).view(*self._box.bricks)
+            where |= {"places": places, "cells": self.shape}
+        density, *more = (wp.to_torch(part).view(shape) for part in self._fields[0].parts)
+        heat = more[0] if self._grids["temperature"] else None
+        return DensityVolume(density, extinction, temperature=heat, emission=emission, **where)
 
     def setup(self) -> SmokeSetup:
         """Returns the settings, with a copy of the obstacles' cells."""

@@ -318,6 +318,8 @@ def _frame_steps(scene: Scene, solver: fluid.Solver, frame: int) -> Iterator[boo
         # The state is of a scene with other steps.
         solver.change_step(count / longest)
         count = longest
+    # Other sources are those of `make_solver` at every step.
+    changes = any(body.eased.moves or body.noise or body.spans != [(0.0, None)] for body in scene.sources)
     while step < count:
         while step % every == 0 and (speed := solver.fastest) > _FAST:
             if 2 * count * solver.substeps > MOST_STEPS:
@@ -328,12 +330,13 @@ def _frame_steps(scene: Scene, solver: fluid.Solver, frame: int) -> Iterator[boo
                 )
             solver.change_step(0.5)
             step, count = 2 * step, 2 * count
-        solver.sources = tuple(sources_at(scene, (frame - 1 + step / count) / scene.rate))
+        if changes:
+            solver.sources = tuple(sources_at(scene, (frame - 1 + step / count) / scene.rate))
         ahead, pair = 1, solver.period
         if solver.device.is_cuda and step % pair == every % pair == 0 and step + pair <= count:
             # On a GPU a pair of steps with the same sources is a graph.
-            later = tuple(sources_at(scene, (frame - 1 + (step + 1) / count) / scene.rate))
-            ahead = pair if later == solver.sources else 1
+            later = changes and tuple(sources_at(scene, (frame - 1 + (step + 1) / count) / scene.rate))
+            ahead = 1 if changes and later != solver.sources else pair
         solver.step(ahead)
         step += ahead
         yield step == count

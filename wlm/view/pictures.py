@@ -1,5 +1,6 @@
 """Writes PNG files: single pictures and contact sheets."""
 
+import functools
 import math
 import os
 from collections.abc import Mapping, Sequence
@@ -25,10 +26,24 @@ def to_bytes(light: torch.Tensor | np.ndarray, white: float = 1.0) -> np.ndarray
     """
     if not 0 < white < math.inf:
         raise ValueError(f"white: expected a number above 0, got {white}")
-    pixels = np.asarray(light.cpu() if isinstance(light, torch.Tensor) else light, np.float32)
-    if pixels.ndim == 2:
-        pixels = np.repeat(pixels[..., None], 3, axis=2)
-    return Display(1.0 / white).picture(pixels)
+    if isinstance(light, torch.Tensor):
+        values = light.float() * (1.0 / white)
+        pixels = torch.bucketize(values, _edges(values.device), right=True, out_int32=True).byte().cpu().numpy()
+    else:
+        pixels = Display(1.0 / white).picture(light)
+    return np.repeat(pixels[..., None], 3, axis=2) if pixels.ndim == 2 else pixels
+
+
+@functools.cache
+def _edges(device: torch.device) -> torch.Tensor:
+    """Returns the least light that `Display` converts to each byte from 1 to 255, float32 [255]: a GPU need not
+    compute the curve as the CPU does."""
+    low, high = (np.full(255, value, np.float32).view(np.int32) for value in (0.0, 1.0))
+    while (high - low > 1).any():
+        middle = low + (high - low) // 2
+        over = Display().picture(middle.view(np.float32)) > np.arange(255)
+        low, high = np.where(over, low, middle), np.where(over, middle, high)
+    return torch.from_numpy(high.view(np.float32)).to(device)
 
 
 def encode(light: np.ndarray, hit: np.ndarray, white: float) -> np.ndarray:

@@ -8,6 +8,7 @@ import numpy as np
 import warp as wp
 
 from wlm.fluid.volume import DensityVolume
+from wlm.interop import StepGraph
 from wlm.smoke.camera import Camera
 from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.march.six_way import guide
@@ -77,7 +78,8 @@ def run(
     """Simulates a scene and draws each of its frames; six-way lighting needs an orthographic camera.
 
     Without `lighting` it is light of all orders with the scene's albedo; `white` is the radiance that becomes white.
-    Each stage waits for the device, so that its duration is measured separately.
+    Each stage waits for the device, so that its duration is measured separately. On CUDA the stages of lighting and of
+    drawing are a graph each, unless a network makes the lightmaps, which waits for the device.
     """
     lighting = Lighting(scene.smoke.albedo) if lighting is None else lighting
     solver = make_solver(scene, device=device)
@@ -86,23 +88,35 @@ def run(
     lights = [light.light() for light in (looks if lighting.albedo is None else scene).lights]
     seen = {"background": looks.background, "ramp": looks.ramp, "obstacles": looks.obstacles}
     drawing = Drawing(camera, lights, albedo=looks.albedo, **seen, device=device)
+    made: SixWay | ScatteredSmoke | None = None
+
+    def light() -> None:
+        nonlocal made
+        volume = volume_of(scene, solver)
+        # Obstacles shadow the surface of lightmaps when these are drawn.
+        made = lighting(volume if lighting.albedo is None else drawing.among(volume), camera, lights)
+
+    graphs: dict[tuple, list[Callable[[], None]]] = {}
     smoke = False
     meter = Meter(progress, "run", scene.frames)
     for number in range(1, scene.frames + 1):
         clock = _Clock(device)
         advance(scene, solver, number)
         solver.check()
-        volume = volume_of(scene, solver)
         clock.stop(SIMULATION)
         drawing.move(scene.time(number))
-        # Obstacles shadow the surface of lightmaps when these are drawn.
-        made = lighting(volume if lighting.albedo is None else drawing.among(volume), camera, lights)
-        clock.stop(lighting.stage)
-        drawing(made)
-        clock.stop(DRAWING)
+        # The solver alternates between buffers, and larger ones may replace them.
+        frame = solver.frame()
+        place = (frame.density.data_ptr(), frame.density.shape)
+        if place not in graphs:
+            steps = light, lambda: drawing(made)
+            graphs[place] = [step if lighting.network else StepGraph(step, device, 1) for step in steps]
+        for stage, step in zip((lighting.stage, DRAWING), graphs[place], strict=True):
+            step()
+            clock.stop(stage)
         pixels = to_bytes(drawing.image, white)
         clock.stop(BYTES)
-        smoke = smoke or bool(volume.density.any())
+        smoke = smoke or any(bool(slab.any()) for slab in frame.slabs(frame.density))
         yield Frame(number, pixels, smoke, clock.seconds)
         meter.report(number)
 

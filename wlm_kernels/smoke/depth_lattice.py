@@ -10,6 +10,7 @@ no two of its rays are parallel.
 Units and sampling are those of `march`.
 """
 
+import functools
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -96,49 +97,54 @@ def _on_line(pair: int, line: int, n: int, k: int) -> wp.vec4i:
     return wp.vec4i(pair, wp.where(pair == 0, n, line), wp.where(pair == 0, line, n), k)
 
 
-@wp.kernel(module="unique", module_options=OPTIONS)
-def _add_up(
-    # in:
-    gaps: wp.array4d[wp.float16],
-    lattice: Lattice,
-    solid: Solid,
-    # out:
-    nodes: wp.array4d[wp.vec2],
-):
-    """Sums optical depths from each node of a line to both of its ends; the light is beyond the last node."""
-    pair, line, k = wp.tid()
-    last = wp.where(pair == 0, nodes.shape[1], nodes.shape[2]) - 1
-    if line >= wp.where(pair == 0, nodes.shape[2], nodes.shape[1]):
-        return
-    # Nodes farther from the last node, and from the first one, are in the shadow of obstacles.
-    lit = float(_NEVER)
-    opposite = float(_NEVER)
-    if solid.mesh != wp.uint64(0):
-        gap = wp.where(pair == 0, lattice.gap[0], lattice.gap[1])
-        lit = _lit_way(solid, _on_line(pair, line, last, k), lattice, axis(lattice, pair)) / gap
-        opposite = _lit_way(solid, _on_line(pair, line, 0, k), lattice, -axis(lattice, pair)) / gap
-    # In double precision, since the depth ahead is a difference. Several nodes at a time, since loads wait for earlier
-    # stores.
-    ahead = wp.float64(0.0)
-    for n in range(last):
-        q = _on_line(pair, line, n, k)
-        ahead += wp.float64(gaps[q[0], q[1], q[2], q[3]])
-    behind = wp.float64(0.0)
-    for begin in range(0, last + 1, _AT_ONCE):
-        several = _Several()
-        for m in range(_AT_ONCE):
-            if begin + m < last:
-                q = _on_line(pair, line, begin + m, k)
-                several[m] = float(gaps[q[0], q[1], q[2], q[3]])
-        for m in range(_AT_ONCE):
-            n = begin + m
-            if n <= last:
-                q = _on_line(pair, line, n, k)
-                a = float(ahead) + wp.where(float(last - n) > lit, _DARK, 0.0)
-                b = float(behind) + wp.where(float(n) > opposite, _DARK, 0.0)
-                nodes[q[0], q[1], q[2], q[3]] = wp.vec2(a, b)
-                ahead -= wp.float64(several[m])
-                behind += wp.float64(several[m])
+# With obstacles in the way the kernel has far more registers.
+@functools.cache
+def _add_up(with_solid: bool) -> wp.Kernel:
+    @wp.kernel(module="unique", module_options=OPTIONS)
+    def kernel(
+        # in:
+        gaps: wp.array4d[wp.float16],
+        lattice: Lattice,
+        solid: Solid,
+        # out:
+        nodes: wp.array4d[wp.vec2],
+    ):
+        """Sums optical depths from each node of a line to both of its ends; the light is beyond the last node."""
+        pair, line, k = wp.tid()
+        last = wp.where(pair == 0, nodes.shape[1], nodes.shape[2]) - 1
+        if line >= wp.where(pair == 0, nodes.shape[2], nodes.shape[1]):
+            return
+        # Nodes farther from the last node, and from the first one, are in the shadow of obstacles.
+        lit = float(_NEVER)
+        opposite = float(_NEVER)
+        if wp.static(with_solid):
+            gap = wp.where(pair == 0, lattice.gap[0], lattice.gap[1])
+            lit = _lit_way(solid, _on_line(pair, line, last, k), lattice, axis(lattice, pair)) / gap
+            opposite = _lit_way(solid, _on_line(pair, line, 0, k), lattice, -axis(lattice, pair)) / gap
+        # In double precision, since the depth ahead is a difference. Several nodes at a time, since loads wait for
+        # earlier stores.
+        ahead = wp.float64(0.0)
+        for n in range(last):
+            q = _on_line(pair, line, n, k)
+            ahead += wp.float64(gaps[q[0], q[1], q[2], q[3]])
+        behind = wp.float64(0.0)
+        for begin in range(0, last + 1, _AT_ONCE):
+            several = _Several()
+            for m in range(_AT_ONCE):
+                if begin + m < last:
+                    q = _on_line(pair, line, begin + m, k)
+                    several[m] = float(gaps[q[0], q[1], q[2], q[3]])
+            for m in range(_AT_ONCE):
+                n = begin + m
+                if n <= last:
+                    q = _on_line(pair, line, n, k)
+                    a = float(ahead) + wp.where(float(last - n) > lit, _DARK, 0.0)
+                    b = float(behind) + wp.where(float(n) > opposite, _DARK, 0.0)
+                    nodes[q[0], q[1], q[2], q[3]] = wp.vec2(a, b)
+                    ahead -= wp.float64(several[m])
+                    behind += wp.float64(several[m])
+
+    return kernel
 
 
 @for_smoke
@@ -252,7 +258,7 @@ def add_up(medium: Medium, lattice: Lattice, counts: Sequence[int], pairs: int, 
     _measure(medium, tuple(counts), [lattice, parts], [gaps], pairs)
     lines = max(counts[:2]) if pairs == 2 else counts[1]
     inputs = [gaps, lattice, medium.solid or Solid()]
-    wp.launch(_add_up, (pairs, lines, counts[2]), inputs, [nodes], device=medium.device)
+    wp.launch(_add_up(medium.solid is not None), (pairs, lines, counts[2]), inputs, [nodes], device=medium.device)
     return nodes
 
 

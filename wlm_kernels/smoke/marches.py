@@ -49,6 +49,11 @@ _BORDER = wp.constant(1.0)  # voxels from the box's faces, nearer to which the t
 _CLEAR = wp.constant(1e-3)  # largest opacity of a pixel that counts as free of smoke
 
 
+def _in_bricks(medium: Medium, march: March) -> Medium:
+    """Returns the smoke with its bricks if steps are shorter than a brick, so that marches skip empty bricks."""
+    return medium.in_bricks() if march.step < BRICK else medium
+
+
 @wp.func
 def _both_depths(smoke: Any, p: wp.vec3, up: wp.vec3, step: float) -> wp.vec2:
     return wp.vec2(optical_depth(smoke, p, up, step), optical_depth(smoke, p, -up, step))
@@ -118,6 +123,7 @@ def guide(medium: Medium, view: View, march: March, out: wp.array, *, shared: bo
         shared: Whether the optical depths to the top and the bottom are interpolated between the nodes of a lattice,
             at least a voxel apart; otherwise each sample marches to the lights itself, which is slower and more exact.
     """
+    medium = _in_bricks(medium, march)
     lattice, nodes = Lattice(), medium.buffer((0, 0, 0), wp.vec2)
     if shared:
         lattice, nodes = reach(medium, view.up, None, replace(march, spacing=max(march.step, 1.0)))
@@ -164,7 +170,7 @@ def _coarse(smoke_type: Any, hot: bool) -> wp.Kernel:
         j = wp.clamp(int(y), 0, nodes.shape[2] - 2)
         fx = wp.clamp(x - float(i), 0.0, 1.0)
         fy = wp.clamp(y - float(j), 0.0, 1.0)
-        loaded = int(-1)  # the plane of nodes whose depths are in `near`
+        loaded = int(-2)  # the plane of nodes whose depths are in `near`
         near = wp.vec4()
         far = wp.vec4()
         while r.done < r.count:
@@ -176,7 +182,10 @@ def _coarse(smoke_type: Any, hot: bool) -> wp.Kernel:
                 z = (r.distance - lattice.low[2]) / lattice.gap[2]
                 k = wp.clamp(int(z), 0, nodes.shape[3] - 2)
                 if k != loaded:
-                    near = _in_plane(nodes, i, j, k, fx, fy)
+                    if k == loaded + 1:
+                        near = far
+                    else:
+                        near = _in_plane(nodes, i, j, k, fx, fy)
                     far = _in_plane(nodes, i, j, k + 1, fx, fy)
                     loaded = k
                 tau = wp.lerp(near, far, wp.clamp(z - float(k), 0.0, 1.0))
@@ -205,8 +214,7 @@ def coarse_six_way(medium: Medium, view: View, march: March, out: wp.array) -> N
     computed at the nodes of a lattice along these axes; rays run along the lattice's third axis. The other two lights
     need no march: of the light from the front, which comes and returns along the ray, a ray of transparency T scatters
     (1 - T^2) / 2 in total; of the light from the back, which passes all smoke of the ray wherever it is scattered,
-    -T ln T. Given T, both are exact for any step. For steps shorter than a brick's edge, 8 voxels, marches skip empty
-    bricks, which changes no result.
+    -T ln T. Given T, both are exact for any step.
 
     Args:
         medium: The smoke, of albedo 1.
@@ -215,8 +223,7 @@ def coarse_six_way(medium: Medium, view: View, march: March, out: wp.array) -> N
         out: float [9, H, W], written: the images `PLANES`, each light of irradiance 4 pi.
     """
     require_orthographic(view, "six-way lightmaps")
-    if march.step < BRICK:
-        medium = medium.in_bricks()
+    medium = _in_bricks(medium, march)
     spacing = march.spacing or march.step
     lattice, counts = make_lattice(medium.shape, (view.right, view.up, view.forward), spacing, view.origin)
     nodes = add_up(medium, lattice, counts, 2, spacing)
@@ -319,7 +326,7 @@ def light(
 
 def unlit(medium: Medium, view: View, march: March, out: wp.array) -> None:
     """Renders unlit smoke: writes the images `UNLIT_PLANES` to `out`, float [3, H, W]; arguments as for `light`."""
-    _unlit(medium, in_tiles(*out.shape[1:]), [view, parameters(march)], [out])
+    _unlit(_in_bricks(medium, march), in_tiles(*out.shape[1:]), [view, parameters(march)], [out])
 
 
 @for_smoke
