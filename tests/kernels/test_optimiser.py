@@ -82,7 +82,9 @@ def test_integer_sums_are_those_of_floats(device: str):
         adam, maps, acc = gather.Adam(), array(values, float, device), array(stored[None], scalar, device)
         adam.decay, adam.epsilon = wp.vec2(0.9, 0.99), 1e-8
         adam.first, adam.second = (array(np.zeros_like(values), float, device) for _ in range(2))
-        gather.update(rates, features.Offsets(), acc, adam, maps, *none, *none, none[0], none[2], control, maps)
+        gather.update(
+            rates, features.Offsets(), acc, adam, maps, *none, *none, none[0], none[2], control, maps, clear=True
+        )
         results.append([maps.numpy(), adam.first.numpy(), adam.second.numpy()])
         assert not acc.numpy().any()
     for floats, integers in zip(*results, strict=True):

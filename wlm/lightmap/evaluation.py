@@ -266,13 +266,12 @@ def _lost_light(model: SheetModel, lightmaps: SheetFrames, device: str) -> list[
 def _doubtful(frame: np.ndarray, valid: np.ndarray) -> list[int]:
     """Returns the tiles of a frame [H, W, 3] with valid texels, bool [H, W], in which PSNR may hide lost light."""
     found: list[int] = []
-    width = valid.shape[1]
-    starts = np.arange(0, width, TILE)
+    starts = np.arange(0, valid.shape[1], TILE)
     for row in range(0, len(valid), TILE):
         inside, light = valid[row : row + TILE], frame[row : row + TILE]
         light = np.maximum(np.maximum(light[..., 0], light[..., 1]), light[..., 2]) * inside
         largest = np.maximum.reduceat(light.max(0), starts)
-        most = np.repeat(largest, TILE)[:width]
+        most = np.repeat(largest, TILE)[: valid.shape[1]]
         marks = np.stack([inside, 2.0 * light >= most, inside & (BRIGHTER * light < most)])
         texels, few, dark = np.add.reduceat(marks.sum(1, dtype=np.int32), starts, axis=1)
         # Where half of the texels are dark, the median is.

@@ -173,7 +173,9 @@ class Trainer:
             self._upload(targets, seed, profile.gamma, slices)
             self.batch.schedule = self._rates_over_steps(profile.final_rate)
             self._draw(seed)
-        self._repeated = [interop.LaunchGraph(partial(self._repeat, stage), device, warmup=1) for stage in range(3)]
+        self._repeated = [
+            interop.LaunchGraph(partial(self._step, stage, _REPEATS), device, warmup=1) for stage in range(3)
+        ]
 
     def _allocate(self, shapes: dict[str, tuple[int, ...]], hidden: int) -> None:
         """Allocates maps of these shapes, networks of a hidden width, and all arrays that a training step writes."""
@@ -201,8 +203,7 @@ class Trainer:
         self._rounded, rounded = features.Maps(), zeros(self._offsets.ut)
         self._rounded.ut, self._rounded.vt = maps.ut, maps.vt
         for key in ("uv_endpoints", "uv_weights", "uvt_endpoints", "uvt_weights"):
-            at, shape = getattr(self._offsets, key), shapes[key]
-            own = rounded[at : at + lengths[key]].view(shape)
+            own = rounded[getattr(self._offsets, key) :][: lengths[key]].view(shapes[key])
             setattr(self._rounded, key, interop.to_warp(own, types.get(key, wp.float32)))
 
         self._lanes = lanes = 1 if self._cuda else CPU_LANES
@@ -215,9 +216,8 @@ class Trainer:
         self.control = zeros(1, dtype=torch.int32)
         self._tracked = zeros(lanes if self._track else 0, n, len(self.axis.times), 2)
         self._rates, self._moments = zeros(4), {}
-        named = {"maps": self.maps, "hidden": self.hidden, "output": self.output}
         self._wrapped_rates = interop.to_warp(self._rates.view(1, 4), wp.vec4)
-        adams = [self._moments_of(*item) for item in named.items()]
+        adams = [self._moments_of(key, getattr(self, key)) for key in ("maps", "hidden", "output")]
 
         vec, wrap = self._kernels.net.vec_hidden, interop.to_warp
         # CUDA stores whole tiles of scalars; the CPU adds whole columns.
@@ -237,7 +237,6 @@ class Trainer:
             wrap(self._partial_out.view(parts, -1)),
             wrap(self._loss_parts),
         )
-        # The arguments of `gather.update`.
         self._update_args: list = [self._wrapped_rates, self._offsets, self._launch_sums[0], adams[0], wrap(self.maps)]
         for sums, moments, values in zip(net_sums, adams[1:], nets, strict=False):
             self._update_args += [sums, moments, wrap(values.view(-1))]
@@ -345,13 +344,10 @@ class Trainer:
         finally:
             torch.set_num_threads(threads)
 
-    def _repeat(self, stage: int) -> None:
-        for _ in range(_REPEATS):
-            self._step(stage)
-
-    def _step(self, stage: int) -> None:
-        self._add_gradients(stage)
-        self._update(stage)
+    def _step(self, stage: int, count: int = 1) -> None:
+        for _ in range(count):
+            self._add_gradients(stage)
+            self._update(stage)
 
     def _round(self) -> None:
         """Puts endpoints and weights on the levels of the file, for steps of quantised maps."""
@@ -370,7 +366,7 @@ class Trainer:
         self._share(lambda lane: self._kernels.launch(*args, lane * span, span))
 
     def _update(self, stage: int) -> None:
-        options = {"frozen": stage == 2, "levels": stage == 1, "lanes": self._lanes}
+        options = {"frozen": stage == 2, "levels": stage == 1, "clear": not self._cuda, "lanes": self._lanes}
         self._share(lambda lane: gather.update(*self._update_args, **options, lane=lane))
 
     def _share(self, work: Callable[[int], None]) -> None:

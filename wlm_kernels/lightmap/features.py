@@ -138,11 +138,6 @@ class Batch:
     rates: wp.array1d[wp.vec4]  # [1] those of this step, written: the launch that uses them also counts the step
 
 
-@wp.func
-def draw_state(batch: Batch, n: int, b: int, samples: int) -> wp.uint32:
-    return wp.rand_init(batch.seed + batch.number[n] * 9973, batch.control[0] * samples + b)
-
-
 @wp.struct
 class Sample:
     """A random training sample of a tile."""
@@ -155,7 +150,7 @@ class Sample:
 @wp.func
 def draw_sample(batch: Batch, n: int, b: int, samples: int) -> Sample:
     """Draws random sample b of tile n for this step: a valid texel and a stored time."""
-    state = draw_state(batch, n, b, samples)
+    state = wp.rand_init(batch.seed + batch.number[n] * 9973, batch.control[0] * samples + b)
     s = Sample()
     s.flat = batch.texels[n, wp.randi(state, 0, batch.texel_count[n])]
     s.k = wp.randi(state, 0, batch.tau.shape[0])

@@ -81,11 +81,11 @@ def _move(values: wp.array1d[float], adam: Adam, i: int, grad: float, rate: floa
 @wp.kernel
 def _update(
     # in:
-    rates: wp.array1d[wp.vec4],
-    offsets: Offsets,
     levels: int,
     base: int,
     clear: int,
+    rates: wp.array1d[wp.vec4],
+    offsets: Offsets,
     # in and out:
     acc: wp.array2d[Any],
     adam: Adam,
@@ -151,49 +151,22 @@ for _scalar in (float, wp.int64):
 
 
 def update(
-    rates: wp.array,
-    offsets: Offsets,
-    acc: wp.array,
-    adam: Adam,
-    maps: wp.array,
-    partial: wp.array,
-    adam_hidden: Adam,
-    hidden: wp.array,
-    partial_out: wp.array,
-    adam_out: Adam,
-    output: wp.array,
-    loss: wp.array,
-    mean_loss: wp.array,
-    control: wp.array,
-    rounded: wp.array,
-    *,
-    frozen: bool = False,
-    levels: bool = False,
-    lane: int = 0,
-    lanes: int = 1,
+    *arguments: Any, frozen: bool = False, levels: bool = False, clear: bool, lane: int = 0, lanes: int = 1
 ) -> None:
     """Converts sums into gradients, updates the parameters with Adam, and counts the step.
 
     Args:
-        rates, offsets: As in `features.Batch`, and the positions of the maps in `maps`.
-        acc: The sums for the M parameters of the maps, as `StepKernels.launch` adds them; set to 0.
-        maps: float [M], the maps, M a multiple of 4; clamped to [0, 1], then updated.
-        partial, partial_out, loss: Sums of P threads or blocks for hidden and output layers and losses, float [P, ...];
-            set to 0 on the CPU, whose next step adds to them.
-        adam, adam_hidden, adam_out, hidden, output: States of the optimisers and the layers, float, updated.
-        mean_loss, control: float [N], running mean of each tile's loss; int [1], number of the step, increased by 1.
-        rounded: float, with `levels` written: the new endpoints and weights on the levels of the file, at their places.
-        frozen: Whether only the networks are updated.
-        levels: Whether `rounded` is written.
+        arguments: Those of `_update` in its order: `rates` and `offsets` as in `features`; of the M parameters of maps,
+            a multiple of 4, the sums `acc` as `StepKernels.launch` adds them (set to 0), the optimiser and `maps`,
+            clamped to [0, 1], then updated; of hidden and output layers the sums of P threads or blocks, float
+            [P, ...], optimiser and parameters; the losses, float [P, N], and their running mean; the number of the
+            step; and `rounded`, which gets the new endpoints and weights on the levels of the file.
+        frozen, levels: Whether only the networks are updated, and whether `rounded` is written.
+        clear: Whether the networks' sums are set to 0, as on the CPU, whose next step adds to them.
         lane, lanes: This launch updates one of so many parts of all parameters; lane 0 counts the step.
     """
+    maps, hidden, output, mean_loss = (arguments[i] for i in (4, 7, 10, 12))
     total = hidden.shape[0] + output.shape[0] + mean_loss.shape[0] + (0 if frozen else maps.shape[0] // 4)
-    span = -(-total // lanes)
-    sums = [acc, adam, maps, partial, adam_hidden, hidden, partial_out, adam_out, output, loss, mean_loss, control]
-    wp.launch(
-        _update,
-        max(0, min(span, total - lane * span)),
-        inputs=[rates, offsets, int(levels), lane * span, int(maps.device.is_cpu), *sums],
-        outputs=[rounded],
-        device=maps.device,
-    )
+    first = lane * -(-total // lanes)
+    count = max(0, min(-(-total // lanes), total - first))
+    wp.launch(_update, count, inputs=[int(levels), first, int(clear), *arguments], device=maps.device)
