@@ -136,6 +136,6 @@ def _memory(bench: Bench, cells: int, steps: int) -> list[Row]:
         model.advance(start, count, begin=0).square().sum().backward()
         torch.cuda.synchronize()
         used = torch.cuda.max_memory_allocated() - before
-        notes = f"{STATES} stored states at most; {used / own:.2f} times the solver's array"
+        notes = f"{STATES} stored states at most; {used / own:.2f} times the solver's arrays"
         rows.append(bench.row("air", f"memory of {count} steps", notes, cells=cells, memory=used / _MIB))
     return rows

@@ -11,5 +11,5 @@ def test_every_row_has_its_figures():
     timed = [row for row in rows if "step_ms" in row.figures]
     assert len(timed) == 8 and {row.method for row in timed} == {"air", "smoke"}
     assert all(row.figures["step_ms"] > 0.0 for row in timed)
-    # Populations of 16^3 cells.
-    assert rows[-1].figures["memory"] == pytest.approx(19 * 16**3 * 4 / 2**20)
+    # Populations of 16^3 cells in two arrays.
+    assert rows[-1].figures["memory"] == pytest.approx(2 * 19 * 16**3 * 4 / 2**20)

@@ -66,19 +66,6 @@ def _flow(kind: str, device: str, solid: bool = True) -> tuple[Lattice, Air]:
     return lattice, Air(box, viscosity=VISCOSITY, ramp=ramp, force=np.zeros((*shape, 3)), **settings)
 
 
-@pytest.mark.parametrize("kind", FLOWS)
-def test_populations_are_in_one_order(kind: str, device: str):
-    """The lattice stores them elsewhere after each step; a step from a copy of them gives the same, to the last bit."""
-    lattice, _ = _flow(kind, device)
-    fluid_cells = lattice.solid.numpy() == 0 if lattice.solid.size else np.ones(lattice.shape, bool)
-    for _ in range(3):
-        air = fluid.DifferentiableLattice(lattice)
-        expected = air.advance(air.populations())
-        lattice.step()
-        assert torch.equal(air.populations()[:, fluid_cells], expected[:, fluid_cells])
-        assert torch.equal(air.fields(expected)[1], wp.to_torch(lattice.velocity()))
-
-
 def _tensor(values: np.ndarray, device: str) -> torch.Tensor:
     return torch.tensor(values, dtype=torch.float32, device=device, requires_grad=True)
 
@@ -278,7 +265,7 @@ def test_tape(smoky: bool, device: str):
 
 
 def _eddying() -> tuple[fluid.DifferentiableLattice, torch.Tensor, int]:
-    """A periodic flow, its populations, and the bytes of its lattice's array."""
+    """A periodic flow, its populations, and the bytes of its lattice's arrays."""
     lattice = Lattice((32, 32, 1), lattice="D2Q9", viscosity=VISCOSITY)
     lattice.set_flow(0.05 * np.random.default_rng(1).uniform(-1, 1, (32, 32, 1, 3)) * (1.0, 1.0, 0.0))
     air = fluid.DifferentiableLattice(lattice)
@@ -286,14 +273,14 @@ def _eddying() -> tuple[fluid.DifferentiableLattice, torch.Tensor, int]:
 
 
 def test_memory_of_200_steps():
-    """200 steps and their backward pass allocate at most 16 times the array of the lattice itself at a time."""
+    """200 steps and their backward pass allocate at most 8 times the arrays of the lattice itself at a time."""
     air, start, own = _eddying()
     with torch.profiler.profile(profile_memory=True) as profile:
         air.advance(start, 200).square().sum().backward()
     events = profile.profiler.kineto_results.events()
     changes = sorted((e.start_ns(), e.nbytes()) for e in events if e.name() == "[memory]")
     peak = np.cumsum([size for _, size in changes]).max()
-    assert own < peak <= 16 * own
+    assert own < peak <= 8 * own
     assert start.grad.any()
 
 
@@ -360,6 +347,9 @@ def test_hard_cases():
 
 def test_refusals():
     """What has no gradient, and what does not fit, is one line."""
+    small = Lattice((4, 4, 1), lattice="D2Q9", viscosity=VISCOSITY, save_memory=True)
+    with pytest.raises(WlmError, match=r"^lattice: expected save_memory=False.*$"):
+        fluid.DifferentiableLattice(small)
     half = Lattice((4, 4, 1), lattice="D2Q9", viscosity=VISCOSITY, storage="float16")
     with pytest.raises(WlmError, match=r"^lattice: expected storage='float32'.*$"):
         fluid.DifferentiableLattice(half)

@@ -106,8 +106,8 @@ def test_too_fast(device: str):
 
 def test_too_large_for_the_memory(device: str, monkeypatch: pytest.MonkeyPatch):
     """The error names the memory needed and that available, before anything is allocated."""
-    monkeypatch.setattr("wlm.fluid.slabs.free_memory", lambda _device: 3 * 2**28)
-    with pytest.raises(WlmError, match=r"256 x 256 x 256 cells need 1\.2 GiB on .*: expected at most the 0\.8 GiB"):
+    monkeypatch.setattr("wlm.fluid.slabs.free_memory", lambda _device: 3 * 2**29)
+    with pytest.raises(WlmError, match=r"256 x 256 x 256 cells need 2\.4 GiB on .*: expected at most the 1\.5 GiB"):
         Lattice((256, 256, 256), viscosity=0.02, device=device)
     with pytest.raises(WlmError, match="fewer than 2"):
         Lattice((2048, 1024, 1024), viscosity=0.02, device=device)

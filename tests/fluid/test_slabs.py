@@ -16,6 +16,7 @@ from wlm.fluid.solver import SCHEMES, Buoyancy, Solver, Source
 from wlm_kernels.fluid.lattice_sets import Slab
 
 SHAPE = (11, 9, 10)
+PLATES = np.indices(SHAPE)[0] % 4 == 1
 RESTING = box_mesh(Trajectory.of([[5.5, 2.0, 5.0]]), (4.0, 2.5, 2.5))
 MOVING = Sphere(Trajectory.of([[3.0, 5.0, 5.0], [8.0, 6.0, 5.0]], [0, 60]), 1.9)
 
@@ -63,10 +64,43 @@ def test_air_is_that_of_one_device(make: Callable[..., Lattice], parts: int, dev
         lattice.step(20)
         lattice.change_step(0.5)
         lattice.step(7)
-        lattice.set_solid(np.indices(SHAPE)[0] % 4 == 1, (0.0, 0.01, 0.0))
+        lattice.set_solid(PLATES, (0.0, 0.01, 0.0))
         lattice.step(5)
     _assert_same(one, several)
     np.testing.assert_allclose(one.force_on_solid(), several.force_on_solid(), rtol=1e-12)
+
+
+@pytest.mark.parametrize("storage", [pytest.param("float32", marks=pytest.mark.slow), "float16"])
+@pytest.mark.parametrize("make", [pytest.param(_periodic, marks=pytest.mark.slow), _tunnel, _closed])
+def test_steps_in_place_give_the_same(make: Callable[..., Lattice], storage: str, device: str):
+    """To the last bit after odd and even numbers of steps, also from a state of the other and on several devices."""
+    two, one = make(device, storage=storage), make([device] * 2, storage=storage, save_memory=True)
+
+    def assert_same() -> None:
+        for read in (Lattice.velocity, Lattice.excess_density):
+            np.testing.assert_array_equal(read(two).numpy(), read(one).numpy())
+        np.testing.assert_allclose(two.force_on_solid(), one.force_on_solid(), rtol=1e-12, atol=1e-15)
+
+    for lattice in (two, one):
+        growth = np.random.default_rng(3).uniform(0, 1e-3, SHAPE).astype(np.float32)
+        lattice.set_growth(wp.array(growth, device=device))
+        lattice.set_bodies([RESTING, MOVING])
+        lattice.step(7)
+    assert_same()
+    states = two.state(), one.state()
+    two.load(states[1])
+    one.load(states[0])
+    for change in (lambda _: None, lambda each: each.change_step(0.5)):
+        for lattice in (two, one):
+            lattice.step(4)
+            change(lattice)
+        assert_same()
+    for lattice in (two, one):
+        lattice.step(1)
+        lattice.set_solid(PLATES, (0.0, 0.01, 0.0))
+        lattice.step(3)
+    assert_same()
+    np.testing.assert_array_equal(two.populations().numpy()[:, ~PLATES], one.populations().numpy()[:, ~PLATES])
 
 
 @pytest.mark.parametrize("storage", ["float32", "float16"])

@@ -49,6 +49,7 @@ LATTICE_STEPS = (
     {"lattice": "D3Q19", "forced": True},
     {"lattice": "D3Q27", "solids": True, "forced": True},
     {"lattice": "D3Q27", "storage": "float16", "eddies": False},
+    {"lattice": "D3Q19", "solids": True, "storage": "float16", "in_place": True},
     {"lattice": "D2Q9"},
 )
 
@@ -96,8 +97,8 @@ def _smoke(dtype: type) -> list:
 
 def _boundaries(kind: tuple[str, str], balance: bool) -> list:
     """Builds the links, whose sums over a block only a GPU has, and what else is of one lattice and storage."""
-    fluid = lattice_fields.fluid_kernels(*kind, (False, True, True))
-    return _members(lattice_links.link_kernels(*kind, balance), fluid)
+    fluid = lattice_fields.fluid_kernels(*kind, (False, True, True), balance)
+    return _members(lattice_links.link_kernels(*kind, balance, False, balance), fluid)
 
 
 def _advection(bricks: bool, solids: bool, stored: type) -> list:
@@ -131,7 +132,12 @@ FACTORIES = [
         "lattice_boundaries", _boundaries, [], (("D3Q19", "float32"), ("D2Q9", "float32"), ("D3Q27", "float16")), BOTH
     ),
     *_cases("fire", lambda stored: [fire.burn_kernel(stored)], [], FLOATS),
-    *_cases("expansion", lambda storage: [fire.expand_kernel("D3Q19", storage)], [], ("float32", "float16")),
+    *_cases(
+        "expansion",
+        lambda storage: [fire.expand_kernel("D3Q19", storage, storage == "float16")],
+        [],
+        ("float32", "float16"),
+    ),
     *_cases("marks", lambda is_mesh: [lattice_bodies._mark_kernel(is_mesh)], [], BOTH),
     *_cases("advection", _advection, [], BOTH, BOTH, FLOATS),
     *_cases("planes", _planes, [], BOTH),

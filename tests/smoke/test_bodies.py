@@ -39,6 +39,18 @@ def _scene(folder, obstacles, **changed) -> Scene:
     return load_scene(path)
 
 
+def test_a_scene_that_saves_memory_has_the_same_air(tmp_path):
+    flows = []
+    for saves in (False, True):
+        scene = _scene(tmp_path, [], air={"save_memory": saves})
+        solver = make_solver(scene)
+        advance(scene, solver, 1)
+        flows.append((len(solver.lattice._arrays), solver.lattice.velocity().numpy()))
+    assert [arrays for arrays, _ in flows] == [2, 1]
+    np.testing.assert_array_equal(flows[0][1], flows[1][1])
+    assert flows[0][1].any()
+
+
 @pytest.mark.parametrize("suffix", ["glb", "gltf", "obj", "stl", "ply", "off"])
 def test_a_surface_from_a_file(tmp_path, suffix):
     """Corners at one place are one, and triangles run anticlockwise from outside."""

@@ -65,7 +65,7 @@ class DifferentiableLattice:
             its two axes in the order x, y, z.
 
     Raises:
-        WlmError: The lattice stores 16-bit floats, or a body of it moves.
+        WlmError: The lattice stores 16-bit floats or saves memory, or a body of it moves.
     """
 
     def __init__(self, lattice: Lattice) -> None:
@@ -73,6 +73,8 @@ class DifferentiableLattice:
         setup = self._setup
         if setup.spec.storage != "float32":
             raise WlmError("lattice: expected storage='float32', since float16 has no gradients, got 'float16'")
+        if setup.spec.in_place:
+            raise WlmError("lattice: expected save_memory=False, since steps in place have no gradients, got True")
         if any((face.kind == WIND).any() for face in lattice.faces.values()):
             raise WlmError("lattice: expected inlets in place of wind, since wind has no gradients, got wind")
         if lattice.moving:
@@ -189,8 +191,7 @@ class DifferentiableLattice:
         setup = self._setup
         spec = replace(setup.spec, forced=forces.shape[0] > 0)
         work.done.fill_(done)
-        # Another array receives the populations, in the same layout.
-        inputs = [0, setup.layout.n, f, setup.solid, setup.tau, setup.eddy, forces, 0, 0]
+        inputs = [0, setup.layout.n, f, setup.solid, setup.tau, setup.eddy, forces, 0]
         outputs = [work.clock, work.trouble, work.sums, out]
         wp.launch(step_kernel(spec), self._cells, inputs=inputs, outputs=outputs, device=f.device)
 

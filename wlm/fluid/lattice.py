@@ -110,6 +110,8 @@ class Lattice:
         lattice: "D2Q9" (Z = 1), "D3Q19" or "D3Q27".
         device: "cpu" or "cuda:N", or several GPUs that read each other's memory, such as "cuda:0,cuda:1", among which
             the cells are divided along x. Results are the same up to rounding.
+        save_memory: Whether steps work in place, which needs half the memory and gives the same flow, but takes longer
+            (docs/notes/fluid-speed.md), and has no gradients.
         ramp: Number of steps in which inlets rise to their velocity. A sudden start causes a sound wave, which walls
             and mass-conserving outlets reflect; with a ramp of four times the cells of the longest axis it is weak.
 
@@ -135,6 +137,7 @@ class Lattice:
         storage: str = "float32",
         lattice: str = "D3Q19",
         device: str | Sequence[str] = "cpu",
+        save_memory: bool = False,
         ramp: int = 0,
     ) -> None:
         self.shape = _checked_shape(shape, lattice)
@@ -145,16 +148,16 @@ class Lattice:
             raise ValueError(f"ramp: expected at least 0 steps, got {ramp}")
         self.slabs = Slabs(self.shape, device)
         self.device = self.slabs.home
-        spec = Spec(lattice, storage, eddies=smagorinsky > 0.0)
-        needed = self.bytes_needed(self.shape, storage, lattice)
-        self.slabs.require("lattice", self.shape, needed, "fewer cells or storage='float16'")
+        spec = Spec(lattice, storage, eddies=smagorinsky > 0.0, in_place=save_memory)
+        needed = self.bytes_needed(self.shape, storage, lattice, save_memory)
+        self.slabs.require("lattice", self.shape, needed, "fewer cells, storage='float16' or save_memory=True")
         self._n, self._cells = wp.vec3i(*self.shape), math.prod(self.shape)
         self._set, self._tables = velocity_set(lattice), tables(lattice, str(self.device))
         size = (len(self._set.c), self._cells)
         # The settings for which the kernel of a step is specialised.
         self._spec = replace(spec, wide=math.prod(size) > NARROW)
-        # The populations, and their parity, see `wlm_kernels.fluid.lattice_sets.MemoryFunctions`.
-        self._f, self._parity = self._zeros(size, STORAGES[storage][0]), 0
+        self._arrays = [self._zeros(size, STORAGES[storage][0]) for _ in range(1 if save_memory else 2)]
+        self._parity = 0  # of the clock and, in place, of the populations; else the array that has them
         # A ramp of one step is no ramp: inflow begins after it.
         self._tau, self._eddy, self._rise = 0.5 + 3.0 * viscosity, eddy_factor(smagorinsky), 1.0 / max(ramp, 1)
         # The counter of steps and the first error, see `wlm_kernels.fluid.lattice.step_kernel`.
@@ -175,10 +178,12 @@ class Lattice:
         self._done, self._unchecked, self._begun = 0, 0, False
 
     @staticmethod
-    def bytes_needed(shape: tuple[int, int, int], storage: str = "float32", lattice: str = "D3Q19") -> int:
+    def bytes_needed(
+        shape: tuple[int, int, int], storage: str = "float32", lattice: str = "D3Q19", save_memory: bool = False
+    ) -> int:
         """Returns the memory in bytes that a lattice takes, without small arrays; arguments as for `Lattice`."""
         size = wp.types.type_size_in_bytes(STORAGES[storage][0])
-        return len(velocity_set(lattice).c) * math.prod(shape) * size
+        return (1 if save_memory else 2) * len(velocity_set(lattice).c) * math.prod(shape) * size
 
     # Setting up.
 
@@ -291,9 +296,9 @@ class Lattice:
         if self._solid.shape[0] == 0:
             self._solid, self._graph = self._zeros(self._cells, wp.uint8), None
         else:
-            means, where = self._zeros((4, self._cells), self._f.dtype), [self._tables, self._layout]
-            inputs = [*where, self._f, self._solid, new]
-            self._launch(self._fluid_kernels.neighbours, self._cells, inputs, [means])
+            where = [self._tables, self._layout]
+            means = self._zeros((4, self._cells), self._f.dtype) if self._spec.in_place else self._spare
+            self._launch(self._fluid_kernels.neighbours, self._cells, [*where, self._f, self._solid, new], [means])
             self._launch(self._fluid_kernels.uncover, self._cells, [*where, self._solid, new, means], [self._f])
         self._spec = replace(self._spec, solids=True)
         wp.copy(self._solid, new)
@@ -330,6 +335,7 @@ class Lattice:
         if not np.isfinite(drho).all():
             raise ValueError("density: expected finite numbers, got NaN or infinity")
         fields = [wp.array(drho, device=self.device), self._vectors("velocity", velocity)]
+        self._spare.zero_()
         self._sums.zero_()
         self._launch(self._fluid_kernels.start, self._cells, [self._tables, self._layout, *fields], [self._f])
         self._apply_links(0)
@@ -472,8 +478,7 @@ class Lattice:
         return total.numpy()[body]
 
     def state(self) -> dict[str, np.ndarray]:
-        """Returns the state, for `load`: populations that have left the cells, solid cells and their motion, number of
-        steps done."""
+        """Returns the state, for `load`: populations that have left cells, solids and their motion, number of steps."""
         self._prepare()
         # On a CPU .numpy() shares the array's memory, which the next step modifies.
         return {
@@ -512,6 +517,7 @@ class Lattice:
         self._solid = self._zeros(len(state["solid"]), wp.uint8)
         self._solid.assign(state["solid"])
         self._spec = replace(self._spec, solids=len(state["solid"]) > 0)
+        self._spare.zero_()
         self._f.assign(state["populations"])
         self._find_links()
         if self._bodies is not None:
@@ -635,16 +641,27 @@ class Lattice:
     # On the device.
 
     @property
+    def _f(self) -> wp.array:
+        """The populations."""
+        return self._arrays[self._parity % len(self._arrays)]
+
+    @property
+    def _spare(self) -> wp.array:
+        """The array that the next step writes; in place the populations themselves."""
+        return self._arrays[(self._parity + 1) % len(self._arrays)]
+
+    @property
     def _layout(self) -> Layout:
-        return self._layouts[self._parity]
+        return self._layouts[self._parity if self._spec.in_place else 0]
 
     def _rows(self) -> Iterator[wp.array]:
-        """Gives each population that has left the cells, [N], in a new array: a copy of all would double the memory."""
+        """Gives each population that has left the cells, [N]: a copy of all of them would double the memory."""
         for q, velocity in enumerate(self._set.c):
-            out = self._zeros(self._cells, self._f.dtype)
-            self._launch(
-                self._fluid_kernels.unpack, self._cells, [self._layout, q, wp.vec3i(*velocity), self._f], [out]
-            )
+            out = self._f[q]
+            if self._layout.parity:
+                out = self._zeros(self._cells, out.dtype)
+                inputs = [self._layout, q, wp.vec3i(*velocity), self._f]
+                self._launch(self._fluid_kernels.unpack, self._cells, inputs, [out])
             yield out
 
     def _prepare(self) -> None:
@@ -657,8 +674,8 @@ class Lattice:
         self._layouts = [make_layout(self.shape, self._bounded, walls, parity) for parity in range(2)]
         kinds = {int(kind) for face in self._faces.values() for kind in np.unique(face.kind)}
         sets = self._spec.lattice, self._spec.storage
-        self._link_kernels = lattice_links.link_kernels(*sets, OUTLET in kinds, self._spec.wide)
-        self._fluid_kernels = fluid_kernels(*sets, walls)
+        self._link_kernels = lattice_links.link_kernels(*sets, OUTLET in kinds, self._spec.wide, self._spec.in_place)
+        self._fluid_kernels = fluid_kernels(*sets, walls, self._spec.in_place)
         links = face_links(self.shape, self._set, self._faces)
         # The links of one slab after those of the other.
         ends = [slab.end * math.prod(self.shape[1:]) for slab in self.slabs.parts]
@@ -706,15 +723,14 @@ class Lattice:
     def _run(self, steps: int) -> None:
         """Queues steps on the device and returns without waiting."""
         for _ in range(steps):
-            before, after = self._parity, 1 - self._parity
-            inputs = [self._n, self._f, self._solid, self._tau, self._eddy, self._forces, before, after]
-            outputs = [self._clock, self._trouble, self._sums, self._f]
+            inputs = [self._n, self._f, self._solid, self._tau, self._eddy, self._forces, self._parity]
+            outputs = [self._clock, self._trouble, self._sums, self._spare]
             # Small blocks are faster with solids, large ones without (docs/notes/fluid-speed.md).
             block_dim = 128 if self._spec.solids else 256
             self.slabs.launch(step_kernel(self._spec), inputs, outputs, block_dim)
-            self._parity = after
+            self._parity = 1 - self._parity
             if self._growth is not None:
-                expand = expand_kernel(self._spec.lattice, self._spec.storage)
+                expand = expand_kernel(self._spec.lattice, self._spec.storage, self._spec.in_place)
                 self.slabs.launch(expand, [self._tables, self._layout, self._growth], [self._f])
             stamp = 1 + self._done % 2
             if self.moving:

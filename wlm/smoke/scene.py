@@ -165,7 +165,7 @@ class Air(_Settings):
         viscosity: Kinematic viscosity in square metres per second; 1.5e-5 for air.
         speed: Speed in metres per second that equals `lattice_speed`; null: that of the fastest inlet or obstacle.
         lattice_speed: Speed in cells per step. Errors grow with its square, the number of steps with its inverse.
-        smagorinsky, storage: As for `wlm.fluid.lattice.Lattice`.
+        smagorinsky, storage, save_memory: As for `wlm.fluid.lattice.Lattice`.
         wind: Wind, in metres and seconds, through the faces `Scene.windy`; null: none.
         confinement: Strength per second of the vorticity confinement (Fedkiw et al. 2001: eps), which keeps small
             eddies; 0: none.
@@ -177,6 +177,7 @@ class Air(_Settings):
     lattice_speed: float = Field(0.1, gt=0.0, le=FASTEST)
     smagorinsky: _NotNegative = 0.17
     storage: Literal["float32", "float16"] = "float32"
+    save_memory: bool = False
     wind: Wind | None = None
     confinement: _NotNegative = 0.0
     turbulence: Turbulence | None = None

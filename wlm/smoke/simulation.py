@@ -348,13 +348,13 @@ def _require_memory(scene: Scene, slabs: Slabs) -> None:
     smoke_bytes = fluid.bytes_needed(
         grid.cells, grid.refine, smoke.scheme, smoke.storage, smoke.hot, smoke.bricks, smoke.fire is not None
     )
-    needed = Lattice.bytes_needed(grid.cells, scene.air.storage) + smoke_bytes
+    needed = Lattice.bytes_needed(grid.cells, scene.air.storage, save_memory=scene.air.save_memory) + smoke_bytes
     if needed > (free := slabs.free):
         air, dense = (" x ".join(map(str, shape)) for shape in (grid.cells, grid.shape))
         raise WlmError(
             f"{scene.name}: {air} cells of air and {dense} voxels of smoke need {needed / 2**30:.1f} GiB on "
-            f"{slabs.name}, but only {free / 2**30:.1f} GiB are free: use fewer cells, a lower refine, bricks, or "
-            "storage: float16"
+            f"{slabs.name}, but only {free / 2**30:.1f} GiB are free: use fewer cells, a lower refine, bricks, "
+            "storage: float16, or air.save_memory"
         )
     # A grid may also have more voxels than can be indexed.
     require_memory("smoke", grid.shape, smoke_bytes, slabs)
@@ -368,6 +368,7 @@ def _make_lattice(scene: Scene, device: str) -> Lattice:
         viscosity=domain.viscosity(air.viscosity),
         smagorinsky=air.smagorinsky,
         storage=air.storage,
+        save_memory=air.save_memory,
         device=device,
         ramp=_RAMP * max(grid.cells),
     )

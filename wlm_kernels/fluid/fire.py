@@ -114,13 +114,14 @@ def burn(box: Box, walls: wp.array, bricks: Bricks, fire: Burning, clock: wp.arr
 
 
 @functools.cache
-def expand_kernel(lattice_name: str, storage: str) -> wp.Kernel:
+def expand_kernel(lattice_name: str, storage: str, in_place: bool = False) -> wp.Kernel:
     """Builds (once) the kernel that adds mass to a slab's cells after a step: a share `growth`, [N], at the cell's
     velocity.
 
     It changes the populations `f`, [Q, N], that leave the cells, before boundary conditions act; solid cells have none.
     """
-    memory, stored = memory_functions(lattice_name, storage, (False, False, False)), STORAGES[storage][0]
+    memory = memory_functions(lattice_name, storage, (False, False, False), in_place=in_place)
+    stored = STORAGES[storage][0]
     load, store, leaving = memory.load, memory.store, memory.leaving
 
     @wp.kernel(module="unique", module_options=_OPTIONS)

@@ -1,12 +1,12 @@
-"""The lattice Boltzmann step: streaming and collision in one pass, in place.
+"""The lattice Boltzmann step: streaming and collision in one pass, over two arrays or in place.
 
 Read `tests/reference/lattice.py` first: it is the same step in float64 NumPy, cell by cell.
 
 A cell reads the populations that arrive, f_q(x, t + 1) = f*_q(x - c_q, t), and writes the populations that leave, f*,
-into the same array elements (`lattice_sets.MemoryFunctions`), which no other cell reads or writes in this step. At a
-wall at rest that closes a whole axis the population that the cell sent there itself arrives (half-way bounce-back). All
-other boundaries are the work of `lattice_links`: the value that the boundary returns is written after the step into the
-element of the population that arrives from beyond a face or out of a solid.
+into another array or, in place, into the same elements, which no other cell reads (`lattice_sets.MemoryFunctions`). At
+a wall at rest that closes a whole axis the population that the cell sent there itself arrives (half-way bounce-back).
+All other boundaries are the work of `lattice_links`: the value that the boundary returns is written after the step into
+the element of the population that arrives from beyond a face or out of a solid.
 
 Collision, with Kupershtokh's exact difference for a force F; the velocity of the fluid is u + F / (2 rho):
 
@@ -73,6 +73,7 @@ class Spec:
         forced: Whether a force acts on the fluid.
         walls: For each axis whether both of its faces are walls at rest.
         wide: Whether elements are indexed in 64 bits, see `lattice_sets.memory_functions`.
+        in_place: Whether a step writes into the array that it reads.
     """
 
     lattice: str
@@ -82,6 +83,7 @@ class Spec:
     forced: bool = False
     walls: tuple[bool, bool, bool] = (False, False, False)
     wide: bool = False
+    in_place: bool = False
 
     def __post_init__(self) -> None:
         lattice(self.lattice)
@@ -153,25 +155,23 @@ def _relax(spec: Spec) -> Any:
 
 @functools.cache
 def step_kernel(spec: Spec) -> wp.Kernel:
-    """Builds (once) the kernel that does a step with the settings of a spec, one thread per cell of a
-    slab.
+    """Builds (once) the kernel that does a step with the settings of a spec, one thread per cell of a slab.
 
     Args of the kernel, for N cells and Q velocities:
         first: Index of the slab's first cell.
         n: Cells along x, y and z.
-        f: [Q, N], the populations that left every cell in the last step, in an array of parity `parity`.
+        f: [Q, N], the populations that left every cell in the last step; in place, of parity `parity`.
         solid: uint8 [N], above 0 where a cell is solid; used if `spec.solids`.
         tau: Relaxation time, 1/2 + 3 nu.
         eddy: `eddy_factor`, used if `spec.eddies`.
         forces: vec3 [N], acceleration of each cell's fluid in cells per step squared, used if `spec.forced`.
         parity: 0 or 1: `clock[parity]` is the number of steps done; the step writes one more to the other element.
-        after: Parity of `out`: the other one if `out` is `f`.
         clock: int [2], counts steps.
         trouble: int64 [1], lowered to the key of the first cell in which the flow blew up, see `trouble_of`.
         sums: float64 [2 P], set to 0, for `lattice_links.apply`.
-        out: [Q, N], `f` or another array: the populations that leave every cell in this step.
+        out: [Q, N], the populations that leave every cell in this step: in place `f`, else another array.
     """
-    memory, relax = memory_functions(spec.lattice, spec.storage, spec.walls, spec.wide), _relax(spec)
+    memory, relax = memory_functions(spec.lattice, spec.storage, spec.walls, spec.wide, spec.in_place), _relax(spec)
     gather, moments, scatter, stored = memory.gather, memory.moments, memory.scatter, STORAGES[spec.storage][0]
 
     @wp.kernel(module="unique", module_options=_OPTIONS)
@@ -185,7 +185,6 @@ def step_kernel(spec: Spec) -> wp.Kernel:
         eddy: float,
         forces: wp.array1d[wp.vec3],
         parity: int,
-        after: int,
         # out:
         clock: wp.array1d[int],
         trouble: wp.array1d[wp.int64],
@@ -214,6 +213,6 @@ def step_kernel(spec: Spec) -> wp.Kernel:
         push = wp.vec3()
         if wp.static(spec.forced):
             push = forces[i]
-        scatter(out, n, _ALL, i, after, relax(drho, j, diagonal, off, push, tau, eddy))
+        scatter(out, n, _ALL, i, 1 - parity, relax(drho, j, diagonal, off, push, tau, eddy))
 
     return step

@@ -43,9 +43,11 @@ class FluidKernels:
 
 
 @functools.cache
-def fluid_kernels(lattice_name: str, storage: str, walls: tuple[bool, bool, bool]) -> FluidKernels:
-    """Builds (once) the kernels that read and set the fluid's density and velocity; `walls`: axes with walls."""
-    memory = memory_functions(lattice_name, storage, walls)
+def fluid_kernels(
+    lattice_name: str, storage: str, walls: tuple[bool, bool, bool], in_place: bool = False
+) -> FluidKernels:
+    """Builds (once) the kernels that read and set the fluid's density and velocity; see `memory_functions`."""
+    memory = memory_functions(lattice_name, storage, walls, in_place=in_place)
     gather, moments, load, store = memory.gather, memory.moments, memory.load, memory.store
     element, arriving, leaving = memory.element, memory.arriving, memory.leaving
     stored, scale = STORAGES[storage]

@@ -108,11 +108,12 @@ def mirrored(t: Tables, n: wp.vec3i, bounded: wp.vec3i, i: int, q: int):
 
 
 @functools.cache
-def link_kernels(lattice_name: str, storage: str, balance: bool, wide: bool = True) -> LinkKernels:
-    """Builds (once) the kernels that set populations at boundaries and sum forces; `balance`: outlets conserve mass;
-    `wide` as for `memory_functions`."""
-    memory = memory_functions(lattice_name, storage, (True, True, True), wide)
-    gather, load, store, moments, vec = memory.gather, memory.load, memory.store, memory.moments, memory.vec
+def link_kernels(
+    lattice_name: str, storage: str, balance: bool, wide: bool = True, in_place: bool = False
+) -> LinkKernels:
+    """Builds (once) the kernels of boundaries and forces; `balance`: outlets conserve mass; see `memory_functions`."""
+    memory = memory_functions(lattice_name, storage, (True, True, True), wide, in_place)
+    departed, load, store, moments = memory.departed, memory.load, memory.store, memory.moments
     element, arriving, leaving = memory.element, memory.arriving, memory.leaving
     stored = STORAGES[storage][0]
     c, w = velocity_set(lattice_name).c, velocity_set(lattice_name).w
@@ -120,12 +121,7 @@ def link_kernels(lattice_name: str, storage: str, balance: bool, wide: bool = Tr
 
     @wp.func
     def moments_at(f: wp.array2d[stored], at: Layout, i: int):
-        # What has left a cell is where, with the other parity, the same arrives from the opposite directions.
-        g = gather(f, at.n, at.walled, i, 1 - at.parity)
-        left = vec()
-        for r in range(wp.static(count)):
-            left[r] = g[wp.static(OPPOSITE[r])]
-        return moments(left)
+        return moments(departed(f, at.n, at.walled, i, at.parity))
 
     @wp.func
     def outflow(t: Tables, at: Layout, f: wp.array2d[stored], i: int, q: int, kind: int, term: float) -> float:
@@ -282,15 +278,14 @@ def link_kernels(lattice_name: str, storage: str, balance: bool, wide: bool = Tr
         p = cell_of(at.n, i)
         total = wp.vec4()
         weight = float(0.0)
-        # These loops are not unrolled: few cells become fluid, and the code would take half a minute to compile.
-        for q in range(1, t.w.shape[0]):
-            beside = p + t.c[q]
+        for q in range(1, wp.static(count)):
+            beside = p + wp.static(wp.vec3i(*c[q]))
             k = index_of(at.n, wrapped(at.n, beside))
             if not crosses(at.n, at.bounded, beside) and solid[k] == wp.uint8(0) and fresh[k] != stamp:
                 drho, j, _diagonal, _off = moments_at(f, at, k)
                 inverse = 1.0 / (1.0 + drho)
-                total += t.w[q] * wp.vec4(drho, inverse * j[0], inverse * j[1], inverse * j[2])
-                weight += t.w[q]
+                total += wp.static(w[q]) * wp.vec4(drho, inverse * j[0], inverse * j[1], inverse * j[2])
+                weight += wp.static(w[q])
         if weight > 0.0:
             total = total / weight
         u = wp.vec3(total[1], total[2], total[3])
@@ -334,8 +329,9 @@ def link_kernels(lattice_name: str, storage: str, balance: bool, wide: bool = Tr
                         # What leaves towards the body and what arrives from it are in these two elements.
                         here = element(f, wp.static(OPPOSITE[q]), i)
                         there = element(f, q, k)
-                        left = wp.where(at.parity == 0, here, there)
-                        store(f, wp.where(at.parity == 0, there, here), load(f, left) + term)
+                        turned = wp.static(in_place) and at.parity != 0
+                        left = wp.where(turned, there, here)
+                        store(f, wp.where(turned, here, there), load(f, left) + term)
                         net += wp.float64(term)
         if wp.static(balance):
             summed(wp.tid(), sums, 0, net)

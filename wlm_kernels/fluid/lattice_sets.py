@@ -195,20 +195,20 @@ NARROW = 2**31 - 1
 class MemoryFunctions:
     """`wp.func`s that read and write populations in memory, for one lattice of Q velocities and one storage type.
 
-    Between two steps, an array of populations, [Q, N], has parity 0 or 1. With parity 0, element (q, k) is the
-    population q that has left cell k. With parity 1, it is the population of the opposite direction that arrives at
-    cell k next. At a wall at rest that closes a whole axis, the population q that leaves cell k is the one that arrives
-    there, so that its element is (q, k) with both parities.
+    Between two steps, an array of populations, [Q, N], has parity 0 or, only if steps work in place, 1. With parity 0,
+    element (q, k) is the population q that has left cell k. With parity 1, it is the population of the opposite
+    direction that arrives at cell k next. At a wall at rest that closes a whole axis, the population q that leaves cell
+    k is the one that arrives there, so that its element is (q, k) with both parities.
 
     The elements from which a cell reads what arrives are thus, with the other parity, those of what leaves the same
     cell in the opposite directions. So a step writes where it has read, and needs one array (the AA pattern: Bailey et
-    al., "Accelerating lattice Boltzmann fluid flow simulations using graphics processors", 2009).
+    al., "Accelerating lattice Boltzmann fluid flow simulations using graphics processors", 2009). Two are faster.
 
     Attributes:
         vec: vec of Q floats.
         gather: (f, n, walled, i, parity) -> scaled vec, the populations that arrive at cell i.
-        scatter: (f, n, walled, i, parity, scaled vec), writes the populations that leave cell i; the parity is that of
-            f after.
+        departed: (f, n, walled, i, parity) -> scaled vec, the populations that have left cell i.
+        scatter: (f, n, walled, i, parity of f after it, scaled vec), writes the populations that leave cell i.
         moments: scaled vec -> rho - 1, momentum, the diagonal and the off-diagonal (xy, xz, yz) of sum_q c c (f - w).
         element: (f, q, i) -> element (q, i).
         arriving: (f, layout, i, p, q, c_q) -> element of the population q that arrives at cell i, which is at p.
@@ -219,6 +219,7 @@ class MemoryFunctions:
 
     vec: Any
     gather: Any
+    departed: Any
     scatter: Any
     moments: Any
     element: Any
@@ -230,13 +231,13 @@ class MemoryFunctions:
 
 @functools.cache
 def memory_functions(
-    lattice_name: str, storage: str, walls: tuple[bool, bool, bool], wide: bool = True
+    lattice_name: str, storage: str, walls: tuple[bool, bool, bool], wide: bool = True, in_place: bool = False
 ) -> MemoryFunctions:
     """Builds (once) the functions for a lattice of `LATTICES` and a storage type of `STORAGES`, by whose scale numbers
     are multiplied, with walls at rest that close some axes.
 
     `wide` indexes populations in 64 bits, which adds a sixth to a step's instructions; otherwise there may be at most
-    `NARROW` of them.
+    `NARROW` of them. Without `in_place`, every array has parity 0, whatever the parity that a function is given.
     """
     c = lattice(lattice_name).c
     count = len(c)
@@ -267,19 +268,19 @@ def memory_functions(
 
     @wp.func
     def arriving(f: wp.array2d[stored], at: Layout, i: int, p: wp.vec3i, q: int, c_q: wp.vec3i) -> index_type:
-        if at.parity != 0:
-            return element(f, opposite(q), i)
+        if wp.static(in_place):
+            if at.parity != 0:
+                return element(f, opposite(q), i)
         if crosses(at.n, at.walled, p - c_q):
             return element(f, opposite(q), i)
         return element(f, q, index_of(at.n, wrapped(at.n, p - c_q)))
 
     @wp.func
     def leaving(f: wp.array2d[stored], at: Layout, i: int, p: wp.vec3i, q: int, c_q: wp.vec3i) -> index_type:
-        if at.parity == 0:
-            return element(f, q, i)
-        if crosses(at.n, at.walled, p + c_q):
-            return element(f, q, i)
-        return element(f, opposite(q), index_of(at.n, wrapped(at.n, p + c_q)))
+        if wp.static(in_place):
+            if at.parity != 0 and not crosses(at.n, at.walled, p + c_q):
+                return element(f, opposite(q), index_of(at.n, wrapped(at.n, p + c_q)))
+        return element(f, q, i)
 
     @wp.func
     def sources(f: wp.array2d[stored], n: wp.vec3i, walled: wp.vec3i, i: int) -> elements:
@@ -315,24 +316,39 @@ def memory_functions(
     @wp.func
     def gather(f: wp.array2d[stored], n: wp.vec3i, walled: wp.vec3i, i: int, parity: int) -> vec:
         g = vec()
-        if parity == 0:
-            k = sources(f, n, walled, i)
-            for q in range(wp.static(count)):
-                g[q] = float(peek(f, k[q]))
-        else:
-            for q in range(wp.static(count)):
-                g[q] = float(peek(f, element(f, wp.static(OPPOSITE[q]), i)))
+        if wp.static(in_place):
+            if parity != 0:
+                for q in range(wp.static(count)):
+                    g[q] = float(peek(f, element(f, wp.static(OPPOSITE[q]), i)))
+                return g
+        k = sources(f, n, walled, i)
+        for q in range(wp.static(count)):
+            g[q] = float(peek(f, k[q]))
+        return g
+
+    @wp.func
+    def departed(f: wp.array2d[stored], n: wp.vec3i, walled: wp.vec3i, i: int, parity: int) -> vec:
+        g = vec()
+        if wp.static(in_place):
+            if parity != 0:
+                k = sources(f, n, walled, i)
+                for q in range(wp.static(count)):
+                    g[q] = float(peek(f, k[wp.static(OPPOSITE[q])]))
+                return g
+        for q in range(wp.static(count)):
+            g[q] = float(peek(f, element(f, q, i)))
         return g
 
     @wp.func
     def scatter(f: wp.array2d[stored], n: wp.vec3i, walled: wp.vec3i, i: int, parity: int, left: vec):
-        if parity == 0:
-            for q in range(wp.static(count)):
-                poke(f, element(f, q, i), f.dtype(left[q]))
-        else:
-            k = sources(f, n, walled, i)
-            for q in range(wp.static(count)):
-                poke(f, k[wp.static(OPPOSITE[q])], f.dtype(left[q]))
+        if wp.static(in_place):
+            if parity != 0:
+                k = sources(f, n, walled, i)
+                for q in range(wp.static(count)):
+                    poke(f, k[wp.static(OPPOSITE[q])], f.dtype(left[q]))
+                return
+        for q in range(wp.static(count)):
+            poke(f, element(f, q, i), f.dtype(left[q]))
 
     @wp.func
     def moments(g: vec):
@@ -351,4 +367,4 @@ def memory_functions(
         unit = wp.static(1.0 / scale)
         return unit * drho, unit * momentum, unit * diagonal, unit * off
 
-    return MemoryFunctions(vec, gather, scatter, moments, element, arriving, leaving, load, store)
+    return MemoryFunctions(vec, gather, departed, scatter, moments, element, arriving, leaving, load, store)
