@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import torch
 
 from wlm import system
 from wlm.errors import WlmError
@@ -25,7 +24,6 @@ from wlm.lightmap.tiles import TILE, TileKind
 from wlm.lightmap.view_scores import VIEWS, ShownScore, Tally, views_of
 from wlm.metrics import BRIGHTER, METRICS, FrameMetrics, LostLight, Summary, evaluate_frame, summarise
 from wlm.system import Meter, OnProgress
-from wlm.workers import each
 
 SCORES = (*METRICS, "seen")
 """Scores that `evaluate` can compute: the metrics of the paper's protocol, and those of `wlm.lightmap.view_scores`."""
@@ -245,39 +243,25 @@ def lost_light(model: LightmapModel, lightmaps: LightmapSet, device: str = "cpu"
 
 def _lost_light(model: SheetModel, lightmaps: SheetFrames, device: str) -> list[str]:
     mask, lost, decoder = scored_mask(model, lightmaps), LostLight(), None
-    threads = torch.get_num_threads()
-    # Torch's threads would take longer to begin than a tile's numbers take.
-    torch.set_num_threads(1)
-    try:
-        looks = each(lambda i: _doubtful(lightmaps.frames[i], mask & lightmaps.valid(i)), range(len(model.times)))
-        for i, (doubtful, stamp) in enumerate(zip(looks, model.times, strict=True)):
-            for start in range(0, len(doubtful), _TILES_AT_ONCE):
-                decoder, some = decoder or SheetDecoder(model, device), doubtful[start : start + _TILES_AT_ONCE]
-                for tile, decoded in zip(some, decoder.tiles(some, stamp), strict=True):
-                    window = model.grid.window(tile)
-                    valid = mask[window] & lightmaps.valid(i)[window]
-                    inner = decoded[: valid.shape[0], : valid.shape[1]][valid]
-                    lost.add(lightmaps.frames[i][window][valid], inner, _place(tile, stamp))
-    finally:
-        torch.set_num_threads(threads)
+    for i, (frame, stamp) in enumerate(zip(lightmaps.frames, model.times, strict=True)):
+        inside, light = mask & lightmaps.valid(i), np.maximum(np.maximum(frame[..., 0], frame[..., 1]), frame[..., 2])
+        doubtful = [each for each in _windows(model) if _may_hide_loss(light[each[1]][inside[each[1]]])]
+        for start in range(0, len(doubtful), _TILES_AT_ONCE):
+            decoder, some = decoder or SheetDecoder(model, device), doubtful[start : start + _TILES_AT_ONCE]
+            for (tile, window), decoded in zip(some, decoder.tiles([tile for tile, _ in some], stamp), strict=True):
+                valid = inside[window]
+                inner = decoded[: valid.shape[0], : valid.shape[1]][valid]
+                lost.add(frame[window][valid], inner, _place(tile, stamp))
     return lost.warnings(model.name, *_LOST)
 
 
-def _doubtful(frame: np.ndarray, valid: np.ndarray) -> list[int]:
-    """Returns the tiles of a frame [H, W, 3] with valid texels, bool [H, W], in which PSNR may hide lost light."""
-    found: list[int] = []
-    starts = np.arange(0, valid.shape[1], TILE)
-    for row in range(0, len(valid), TILE):
-        inside, light = valid[row : row + TILE], frame[row : row + TILE]
-        light = np.maximum(np.maximum(light[..., 0], light[..., 1]), light[..., 2]) * inside
-        largest = np.maximum.reduceat(light.max(0), starts)
-        most = np.repeat(largest, TILE)[: valid.shape[1]]
-        marks = np.stack([inside, 2.0 * light >= most, inside & (BRIGHTER * light < most)])
-        texels, few, dark = np.add.reduceat(marks.sum(1, dtype=np.int32), starts, axis=1)
-        # Where half of the texels are dark, the median is.
-        chosen = (largest > 0) & ((few <= _FEW_TEXELS) & (texels > _FEW_TEXELS) | (2 * dark >= texels))
-        found += (row // TILE * len(starts) + np.flatnonzero(chosen)).tolist()
-    return found
+def _may_hide_loss(light: np.ndarray) -> bool:
+    """Returns whether PSNR may hide lost light among these valid texels of a tile, float32 [K]."""
+    if not len(light) or not (largest := light.max()) > 0:
+        return False
+    few = np.count_nonzero(2.0 * light >= largest) <= _FEW_TEXELS < len(light)
+    # A sixteenth of the texels is enough for a median that decides what is decoded.
+    return few or largest > BRIGHTER * np.median(light[::16])
 
 
 def _windows(model: SheetModel) -> Iterator[tuple[int, tuple[slice, slice]]]:

@@ -122,12 +122,9 @@ class Trainer:
     `state` holds everything that a later step depends on, so that a resumed fit continues exactly.
 
     Attributes:
-        axis: The time axis.
-        steps: Number of steps of the fit.
-        frozen: The first step at which only the network is trained.
-        device: The device, as `interop.check_device` returns it.
-        numbers: int32 [N], numbers of the tiles in their grid.
-        tiles: N, the number of tiles.
+        axis, device: The time axis, and the device, as `interop.check_device` returns it.
+        steps, frozen: Number of steps of the fit, and the first at which only the network is trained.
+        numbers, tiles: int32 [N], numbers of the tiles in their grid, and N.
         views: The maps by name, as `wlm_kernels.lightmap.features.Maps` has them: views of `maps`.
         maps: float32 [M], all M parameters of the maps.
         hidden, output: The networks, see `wlm_kernels.mlp`.
@@ -232,15 +229,10 @@ class Trainer:
         self._nets = [(wrap(values[0], vec), wrap(values[1], wp.vec3)) for values in (nets, self._on_levels)]
         self._levels_args = tuple(wrap(values) for values in (*nets, *self._on_levels))
         self._launch_sums = (wrap(self._acc), *shaped)
-        net_sums = (
-            wrap(self._partial.view(parts, -1)),
-            wrap(self._partial_out.view(parts, -1)),
-            wrap(self._loss_parts),
-        )
         self._update_args: list = [self._wrapped_rates, self._offsets, self._launch_sums[0], adams[0], wrap(self.maps)]
-        for sums, moments, values in zip(net_sums, adams[1:], nets, strict=False):
-            self._update_args += [sums, moments, wrap(values.view(-1))]
-        self._update_args += [net_sums[2], wrap(self.loss), wrap(self.control), wrap(rounded)]
+        for sums, moments, values in zip((self._partial, self._partial_out), adams[1:], nets, strict=True):
+            self._update_args += [wrap(sums.view(parts, -1)), moments, wrap(values.view(-1))]
+        self._update_args += [wrap(self._loss_parts), wrap(self.loss), wrap(self.control), wrap(rounded)]
 
     def _moments_of(self, name: str, values: torch.Tensor) -> gather.Adam:
         """Returns the state of the optimiser (Adam) for one array of parameters, with all moments 0."""

@@ -156,10 +156,9 @@ def _reconstruct(
     out: wp.array3d[wp.vec4],
 ):
     s, y, x = wp.tid()
-    # Not `texel`: a caller's tensor may begin anywhere in memory.
-    e0 = ste_endpoint(endpoints[s, y // 4, x // 4, 0], quantised)
-    e1 = ste_endpoint(endpoints[s, y // 4, x // 4, 1], quantised)
-    out[s, y, x] = ste_mix(e0, e1, ste_weight(weights[s, y, x], quantised), quantised)
+    e0, e1 = endpoints[s, y // 4, x // 4, 0], endpoints[s, y // 4, x // 4, 1]  # at any address, unlike `texel`'s
+    w = ste_weight(weights[s, y, x], quantised)
+    out[s, y, x] = ste_mix(ste_endpoint(e0, quantised), ste_endpoint(e1, quantised), w, quantised)
 
 
 @wp.kernel

@@ -149,7 +149,9 @@ class Sample:
 
 @wp.func
 def draw_sample(batch: Batch, n: int, b: int, samples: int) -> Sample:
-    """Draws random sample b of tile n for this step: a valid texel and a stored time."""
+    """Draws random sample b of tile n for this step: a valid texel and a stored time; the first writes rates."""
+    if n == 0 and b == 0:
+        batch.rates[0] = batch.schedule[wp.min(batch.control[0], batch.schedule.shape[0] - 1)]
     state = wp.rand_init(batch.seed + batch.number[n] * 9973, batch.control[0] * samples + b)
     s = Sample()
     s.flat = batch.texels[n, wp.randi(state, 0, batch.texel_count[n])]

@@ -117,7 +117,6 @@ def _update(
         return
     t -= output.shape[0]
     if t < mean_loss.shape[0]:
-        # A running mean over about 50 steps.
         mean_loss[t] += (_drain(loss, t, clear) - mean_loss[t]) * 0.02
         return
     t -= mean_loss.shape[0]
@@ -153,17 +152,14 @@ for _scalar in (float, wp.int64):
 def update(
     *arguments: Any, frozen: bool = False, levels: bool = False, clear: bool, lane: int = 0, lanes: int = 1
 ) -> None:
-    """Converts sums into gradients, updates the parameters with Adam, and counts the step.
+    """Converts sums into gradients, updates the parameters with Adam and running means of losses, and counts the step.
 
     Args:
-        arguments: Those of `_update` in its order: `rates` and `offsets` as in `features`; of the M parameters of maps,
-            a multiple of 4, the sums `acc` as `StepKernels.launch` adds them (set to 0), the optimiser and `maps`,
-            clamped to [0, 1], then updated; of hidden and output layers the sums of P threads or blocks, float
-            [P, ...], optimiser and parameters; the losses, float [P, N], and their running mean; the number of the
-            step; and `rounded`, which gets the new endpoints and weights on the levels of the file.
+        arguments: Those of `_update` in its order. Sums are as `StepKernels.launch` adds them, those of maps are set to
+            0; `maps` are clamped to [0, 1], then updated; `rounded` gets their levels in the file.
         frozen, levels: Whether only the networks are updated, and whether `rounded` is written.
         clear: Whether the networks' sums are set to 0, as on the CPU, whose next step adds to them.
-        lane, lanes: This launch updates one of so many parts of all parameters; lane 0 counts the step.
+        lane, lanes: This launch updates one of so many parts of all parameters.
     """
     maps, hidden, output, mean_loss = (arguments[i] for i in (4, 7, 10, 12))
     total = hidden.shape[0] + output.shape[0] + mean_loss.shape[0] + (0 if frozen else maps.shape[0] // 4)

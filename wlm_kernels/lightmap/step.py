@@ -211,8 +211,6 @@ def step_kernels(hidden: int, gelu: str, device_kind: str) -> StepKernels:
         ):
             n, i = wp.tid()
             b = base + i
-            if n == 0 and b == 0:
-                batch.rates[0] = batch.schedule[wp.min(batch.control[0], batch.schedule.shape[0] - 1)]
             lane = wp.where(base == 0, 0, 1)
             sample = draw_sample(batch, n, b, samples)
             k = sample.k
@@ -262,8 +260,6 @@ def step_kernels(hidden: int, gelu: str, device_kind: str) -> StepKernels:
             loss: wp.array1d[float],
         ):
             n, b = wp.tid()
-            if n == 0 and b == 0:
-                batch.rates[0] = batch.schedule[wp.min(batch.control[0], batch.schedule.shape[0] - 1)]
             sample = draw_sample(batch, n, b, samples)
             k = sample.k
             f = features(maps, batch, n, sample.flat // 128, sample.flat % 128, k, sample.state)
