@@ -128,8 +128,7 @@ class Trainer:
         views: The maps by name, as `wlm_kernels.lightmap.features.Maps` has them: views of `maps`.
         maps: float32 [M], all M parameters of the maps.
         hidden, output: The networks, see `wlm_kernels.mlp`.
-        loss: float32 [N], running mean of each tile's loss over about 50 steps.
-        control: int32 [1], number of steps done.
+        loss, control: float32 [N], running mean of each tile's loss over about 50 steps; int32 [1], steps done.
         batch: The training data in the form that the kernels read.
     """
 

@@ -157,12 +157,10 @@ def update(
     Args:
         arguments: Those of `_update` in its order. Sums are as `StepKernels.launch` adds them, those of maps are set to
             0; `maps` are clamped to [0, 1], then updated; `rounded` gets their levels in the file.
-        frozen, levels: Whether only the networks are updated, and whether `rounded` is written.
-        clear: Whether the networks' sums are set to 0, as on the CPU, whose next step adds to them.
+        frozen, levels, clear: Whether only networks are updated, `rounded` is written, networks' sums are set to 0.
         lane, lanes: This launch updates one of so many parts of all parameters.
     """
     maps, hidden, output, mean_loss = (arguments[i] for i in (4, 7, 10, 12))
     total = hidden.shape[0] + output.shape[0] + mean_loss.shape[0] + (0 if frozen else maps.shape[0] // 4)
-    first = lane * -(-total // lanes)
-    count = max(0, min(-(-total // lanes), total - first))
-    wp.launch(_update, count, inputs=[int(levels), first, int(clear), *arguments], device=maps.device)
+    first, last = (min(total, each * -(-total // lanes)) for each in (lane, lane + 1))
+    wp.launch(_update, last - first, inputs=[int(levels), first, int(clear), *arguments], device=maps.device)
