@@ -99,7 +99,7 @@ class Case:
 
 
 _HOURS = 26
-_STEPS = 64  # of a fit or a lattice in one call
+_STEPS = 50  # of a fit or a lattice in one call, as many as a fit repeats in a CUDA graph
 _SPEED = 0.1
 
 

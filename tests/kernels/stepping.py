@@ -157,11 +157,12 @@ def fused_step(trainer: Trainer, quantised: bool) -> Step:
     """Does one step; its gradients are the sums that its second half takes."""
     before = trainer.losses().astype(np.float64)
     with interop.stream(trainer.device):
-        trainer._add_gradients(quantised)
+        trainer._round()
+        trainer._add_gradients(int(quantised))
         flat, hidden, output = (
             values.sum(0).cpu().numpy() for values in (trainer._acc, trainer._partial, trainer._partial_out)
         )
-        trainer._update(True)
+        trainer._update(int(quantised))
     flat = flat if trainer.device == "cpu" else (flat * 2.0**-40).astype(np.float32)
     grads, at = {}, 0
     for key, view in trainer.views.items():

@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -27,7 +28,8 @@ _STATE = ("maps", "hidden", "output", "loss", "control")
 
 _MOMENTUM = 0.9  # Adam's decay of gradients
 _ADAM_EPSILON = 1e-8  # the loss is a mean over the samples and channels of a tile
-_CHUNK = {"cpu": 5, "cuda": 50}  # steps between two looks at the clock
+_CHUNK = {"cpu": 5, "cuda": 200}  # steps between two looks at the clock
+_REPEATS = 50  # steps in one CUDA graph, so that the GPU does not wait for the host between them
 
 
 class Targets:
@@ -120,17 +122,13 @@ class Trainer:
     `state` holds everything that a later step depends on, so that a resumed fit continues exactly.
 
     Attributes:
-        axis: The time axis.
-        steps: Number of steps of the fit.
-        frozen: The first step at which only the network is trained.
-        device: The device, as `interop.check_device` returns it.
-        numbers: int32 [N], numbers of the tiles in their grid.
-        tiles: N, the number of tiles.
+        axis, device: The time axis, and the device, as `interop.check_device` returns it.
+        steps, frozen: Number of steps of the fit, and the first at which only the network is trained.
+        numbers, tiles: int32 [N], numbers of the tiles in their grid, and N.
         views: The maps by name, as `wlm_kernels.lightmap.features.Maps` has them: views of `maps`.
         maps: float32 [M], all M parameters of the maps.
         hidden, output: The networks, see `wlm_kernels.mlp`.
-        loss: float32 [N], running mean of each tile's loss over about 50 steps.
-        control: int32 [1], number of steps done.
+        loss, control: float32 [N], running mean of each tile's loss over about 50 steps; int32 [1], steps done.
         batch: The training data in the form that the kernels read.
     """
 
@@ -169,12 +167,10 @@ class Trainer:
         with interop.stream(device):
             self._allocate(shapes, profile.hidden)
             self._upload(targets, seed, profile.gamma, slices)
-            self._schedule = self._rates_over_steps(profile.final_rate)
+            self.batch.schedule = self._rates_over_steps(profile.final_rate)
             self._draw(seed)
-        self._stages = [
-            interop.StepGraph(lambda: self._step(False, True), device, warmup=2),
-            interop.StepGraph(lambda: self._step(True, True), device, warmup=1),
-            interop.StepGraph(lambda: self._step(True, False), device, warmup=1),
+        self._repeated = [
+            interop.LaunchGraph(partial(self._step, stage, _REPEATS), device, warmup=1) for stage in range(3)
         ]
 
     def _allocate(self, shapes: dict[str, tuple[int, ...]], hidden: int) -> None:
@@ -200,10 +196,11 @@ class Trainer:
             setattr(maps, key, interop.to_warp(view, types.get(key, wp.float32)))
         self._maps = maps
         # The maps on the levels of the file, which a step reads once they are quantised.
-        self._rounded = features.Maps()
+        self._rounded, rounded = features.Maps(), zeros(self._offsets.ut)
         self._rounded.ut, self._rounded.vt = maps.ut, maps.vt
         for key in ("uv_endpoints", "uv_weights", "uvt_endpoints", "uvt_weights"):
-            setattr(self._rounded, key, wp.empty_like(getattr(maps, key)))
+            own = rounded[getattr(self._offsets, key) :][: lengths[key]].view(shapes[key])
+            setattr(self._rounded, key, interop.to_warp(own, types.get(key, wp.float32)))
 
         self._lanes = lanes = 1 if self._cuda else CPU_LANES
         parts = self._samples // lightmap_step.BLOCK if self._cuda else lanes
@@ -215,8 +212,8 @@ class Trainer:
         self.control = zeros(1, dtype=torch.int32)
         self._tracked = zeros(lanes if self._track else 0, n, len(self.axis.times), 2)
         self._rates, self._moments = zeros(4), {}
-        named = {"maps": self.maps, "hidden": self.hidden, "output": self.output}
-        adams = [self._moments_of(*item) for item in named.items()]
+        self._wrapped_rates = interop.to_warp(self._rates.view(1, 4), wp.vec4)
+        adams = [self._moments_of(key, getattr(self, key)) for key in ("maps", "hidden", "output")]
 
         vec, wrap = self._kernels.net.vec_hidden, interop.to_warp
         # CUDA stores whole tiles of scalars; the CPU adds whole columns.
@@ -231,15 +228,10 @@ class Trainer:
         self._nets = [(wrap(values[0], vec), wrap(values[1], wp.vec3)) for values in (nets, self._on_levels)]
         self._levels_args = tuple(wrap(values) for values in (*nets, *self._on_levels))
         self._launch_sums = (wrap(self._acc), *shaped)
-        net_sums = (
-            wrap(self._partial.view(parts, -1)),
-            wrap(self._partial_out.view(parts, -1)),
-            wrap(self._loss_parts),
-        )
-        # The last arguments of `update_maps` and `update_net`.
-        self._maps_update = wrap(self._acc), adams[0], wrap(self.maps), wrap(self._rates)
-        flat = (wrap(values.view(-1)) for values in nets)
-        self._net_update = *net_sums, wrap(self._rates), *adams[1:], *flat, wrap(self.loss), wrap(self.control)
+        self._update_args: list = [self._wrapped_rates, self._offsets, self._launch_sums[0], adams[0], wrap(self.maps)]
+        for sums, moments, values in zip((self._partial, self._partial_out), adams[1:], nets, strict=True):
+            self._update_args += [wrap(sums.view(parts, -1)), moments, wrap(values.view(-1))]
+        self._update_args += [wrap(self._loss_parts), wrap(self.loss), wrap(self.control), wrap(rounded)]
 
     def _moments_of(self, name: str, values: torch.Tensor) -> gather.Adam:
         """Returns the state of the optimiser (Adam) for one array of parameters, with all moments 0."""
@@ -279,16 +271,18 @@ class Trainer:
         batch.seed = seed
         batch.emphasis = targets.emphasis
         batch.periodic = int(self.axis.periodic)
-        batch.quantised = 0
+        batch.quantised = batch.frozen = 0
+        batch.rates = self._wrapped_rates
         self.batch = batch
 
     def _rates_over_steps(self, final_rate: float) -> wp.array:
-        """Returns the learning rate and Adam's two bias corrections of each step, vec3 [steps]."""
+        """Returns the rates of maps and networks and Adam's two bias corrections at each step, vec4 [steps]."""
         share = np.linspace(0.0, 1.0, self.steps)
         values = final_rate + (1.0 - final_rate) * 0.5 * (1.0 + np.cos(np.pi * share))
         done = np.arange(1, self.steps + 1)
         corrections = 1.0 / (1.0 - _MOMENTUM**done), 1.0 / np.sqrt(1.0 - self._decay**done)
-        return wp.array(np.stack([values, *corrections], 1).astype(np.float32), dtype=wp.vec3, device=self.device)
+        rates = (np.float32(rate) * values.astype(np.float32) for rate in self._first_rates)
+        return wp.array(np.stack([*rates, *corrections], 1).astype(np.float32), dtype=wp.vec4, device=self.device)
 
     def _draw(self, seed: int) -> None:
         """Draws random initial parameters. Each tile has its own generator, so that batching does not change them."""
@@ -320,43 +314,51 @@ class Trainer:
 
     def run(self, steps: int) -> None:
         """Runs the given number of training steps; on a GPU it only queues them."""
-        first = self.step
-        threads = torch.get_num_threads()
+        step, threads = self.step, torch.get_num_threads()
+        end = step + steps
         try:
             if not self._cuda:
                 # A second thread of torch would spin between its calls, on the core that a lane needs.
                 torch.set_num_threads(1)
             with interop.stream(self.device):
-                for step in range(first, first + steps):
-                    self._stages[self.stage(step)]()
+                first_quantised = max(step, self._quantised_from)
+                while step < end:
+                    stage, last = self.stage(step), step + _REPEATS
+                    if step == first_quantised:
+                        self._round()  # each step of quantised maps does it for the next one
+                    if self._cuda and last <= end and self.stage(last - 1) == stage:
+                        self._repeated[stage]()
+                        step = last
+                    else:
+                        self._step(stage)
+                        step += 1
         finally:
             torch.set_num_threads(threads)
 
-    def _step(self, quantised: bool, move_maps: bool) -> None:
-        self._add_gradients(quantised)
-        self._update(move_maps)
+    def _step(self, stage: int, count: int = 1) -> None:
+        for _ in range(count):
+            self._add_gradients(stage)
+            self._update(stage)
 
-    def _add_gradients(self, quantised: bool) -> None:
-        maps = self._maps
-        self.batch.quantised = 0
-        if quantised:
-            self.batch.quantised, maps = 2, self._rounded
-            for pair in (("uv_endpoints", "uv_weights"), ("uvt_endpoints", "uvt_weights")):
-                blocks.round_to_levels(*(getattr(each, name) for each in (self._maps, maps) for name in pair))
+    def _round(self) -> None:
+        """Puts endpoints and weights on the levels of the file, for steps of quantised maps."""
+        for pair in (("uv_endpoints", "uv_weights"), ("uvt_endpoints", "uvt_weights")):
+            blocks.round_to_levels(*(getattr(each, name) for each in (self._maps, self._rounded) for name in pair))
+
+    def _add_gradients(self, stage: int) -> None:
+        quantised = stage > 0
+        self.batch.quantised, self.batch.frozen = 2 * quantised, int(stage == 2)
         on_levels = quantised and self._integers
         if on_levels:
             levels.put_on_levels(*self._levels_args)
-        hidden, output = self._nets[on_levels]
-        args = (maps, self._offsets, hidden, output, self.batch, self._samples, *self._launch_sums)
+        maps, nets = self._rounded if quantised else self._maps, self._nets[on_levels]
+        args = (maps, self._offsets, *nets, self.batch, self._samples, *self._launch_sums)
         span = self._samples // self._lanes
         self._share(lambda lane: self._kernels.launch(*args, lane * span, span))
 
-    def _update(self, move_maps: bool) -> None:
-        args = (self._schedule, self._first_rates, self.batch.control, move_maps, *self._maps_update)
-        total = self.maps.numel()
-        span = -(-total // self._lanes)
-        self._share(lambda lane: gather.update_maps(*args, lane * span, min(span, total - lane * span)))
-        gather.update_net(*self._net_update)
+    def _update(self, stage: int) -> None:
+        options = {"frozen": stage == 2, "levels": stage == 1, "clear": not self._cuda, "lanes": self._lanes}
+        self._share(lambda lane: gather.update(*self._update_args, **options, lane=lane))
 
     def _share(self, work: Callable[[int], None]) -> None:
         """Runs `work(i)` for each lane i, each in its own thread; kernel launches release Python's lock."""

@@ -12,7 +12,7 @@ from typing import Any
 import warp as wp
 
 from wlm_kernels.interpolate import axis_index, cell, fraction
-from wlm_kernels.lightmap.blocks import ste_endpoint, ste_weight
+from wlm_kernels.lightmap.blocks import endpoint_at, ste_endpoint, ste_weight
 from wlm_kernels.lightmap.features import Maps, Offsets
 from wlm_kernels.native import native_source
 
@@ -101,8 +101,8 @@ def scatters(device_kind: str) -> tuple[Any, Any, Any, Any]:
     ):
         width = maps.uv_weights.shape[2]
         height = maps.uv_weights.shape[1]
-        e0 = ste_endpoint(maps.uv_endpoints[n, y // 4, x // 4, 0], quantised)
-        e1 = ste_endpoint(maps.uv_endpoints[n, y // 4, x // 4, 1], quantised)
+        e0 = ste_endpoint(endpoint_at(maps.uv_endpoints, n, y // 4, x // 4, 0), quantised)
+        e1 = ste_endpoint(endpoint_at(maps.uv_endpoints, n, y // 4, x // 4, 1), quantised)
         w = ste_weight(maps.uv_weights[n, y, x], quantised)
         add(acc, lane, offsets.uv_weights + (n * height + y) * width + x, wp.dot(e1 - e0, g))
         block = (n * (height // 4) + y // 4) * (width // 4) + x // 4
@@ -152,8 +152,8 @@ def scatters(device_kind: str) -> tuple[Any, Any, Any, Any]:
                     if (j == 0 or by != ya // 4) and (i == 0 or bx != xa // 4):
                         cy = corner_weights(ya, yb, fy, by) * ct
                         cx = corner_weights(xa, xb, fx, bx)
-                        e0 = ste_endpoint(maps.uvt_endpoints[s, by, bx, 0], quantised)
-                        e1 = ste_endpoint(maps.uvt_endpoints[s, by, bx, 1], quantised)
+                        e0 = ste_endpoint(endpoint_at(maps.uvt_endpoints, s, by, bx, 0), quantised)
+                        e1 = ste_endpoint(endpoint_at(maps.uvt_endpoints, s, by, bx, 1), quantised)
                         along = wp.dot(e1 - e0, g)
                         for q in range(four):
                             c = cy[q // 2] * cx[q % 2]

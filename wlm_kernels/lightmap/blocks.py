@@ -15,6 +15,8 @@ times). Blocks of the file are `[S, H/4, W/4, 2]` of uint64, the low and the hig
 
 import warp as wp
 
+from wlm_kernels.native import native_source
+
 wp.set_module_options({"enable_backward": False})
 
 
@@ -102,13 +104,17 @@ def ste_mix(e0: wp.vec4, e1: wp.vec4, w: float, quantised: int) -> wp.vec4:
     )
 
 
+@wp.func_native(native_source(__package__, "endpoint_at"))
+def endpoint_at(values: wp.array4d[wp.vec4], s: int, y: int, x: int, e: int) -> wp.vec4: ...
+
+
 @wp.func
 def texel(
     endpoints: wp.array4d[wp.vec4], weights: wp.array3d[float], s: int, y: int, x: int, quantised: int
 ) -> wp.vec4:
     """Returns the texel (y, x) of slice s of a map in training, from its endpoints and weights."""
-    e0 = ste_endpoint(endpoints[s, y // 4, x // 4, 0], quantised)
-    e1 = ste_endpoint(endpoints[s, y // 4, x // 4, 1], quantised)
+    e0 = ste_endpoint(endpoint_at(endpoints, s, y // 4, x // 4, 0), quantised)
+    e1 = ste_endpoint(endpoint_at(endpoints, s, y // 4, x // 4, 1), quantised)
     return ste_mix(e0, e1, ste_weight(weights[s, y, x], quantised), quantised)
 
 
@@ -150,7 +156,9 @@ def _reconstruct(
     out: wp.array3d[wp.vec4],
 ):
     s, y, x = wp.tid()
-    out[s, y, x] = texel(endpoints, weights, s, y, x, quantised)
+    e0, e1 = endpoints[s, y // 4, x // 4, 0], endpoints[s, y // 4, x // 4, 1]  # at any address, unlike `texel`'s
+    w = ste_weight(weights[s, y, x], quantised)
+    out[s, y, x] = ste_mix(ste_endpoint(e0, quantised), ste_endpoint(e1, quantised), w, quantised)
 
 
 @wp.kernel

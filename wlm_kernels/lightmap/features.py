@@ -15,6 +15,7 @@ import warp as wp
 
 from wlm_kernels.interpolate import axis_index, cell, fraction
 from wlm_kernels.lightmap.blocks import texel
+from wlm_kernels.native import native_source
 
 INPUTS, MAP_INPUTS = 16, 12
 """Inputs of a network, and those of them that come from the maps; the encoded time follows."""
@@ -55,8 +56,13 @@ def ste_byte(v: float, quantised: int) -> float:
     return wp.floor(c * 255.0 + 0.5) / 255.0
 
 
+@wp.func_native(native_source(__package__, "plane_texel"))
+def plane_texel(values: wp.array3d[wp.vec2], n: int, t: int, x: int) -> wp.vec2: ...
+
+
 @wp.func
-def ste_byte2(v: wp.vec2, quantised: int) -> wp.vec2:
+def level_at(plane: wp.array3d[wp.vec2], n: int, t: int, x: int, quantised: int) -> wp.vec2:
+    v = plane_texel(plane, n, t, x)
     return wp.vec2(ste_byte(v[0], quantised), ste_byte(v[1], quantised))
 
 
@@ -72,8 +78,8 @@ def plane_at(plane: wp.array3d[wp.vec2], n: int, p: float, tau: float, periodic:
     xb = axis_index(x + 1, columns, 0)
     ta = axis_index(t, rows, periodic)
     tb = axis_index(t + 1, rows, periodic)
-    early = (1.0 - fx) * ste_byte2(plane[n, ta, xa], quantised) + fx * ste_byte2(plane[n, ta, xb], quantised)
-    late = (1.0 - fx) * ste_byte2(plane[n, tb, xa], quantised) + fx * ste_byte2(plane[n, tb, xb], quantised)
+    early = (1.0 - fx) * level_at(plane, n, ta, xa, quantised) + fx * level_at(plane, n, ta, xb, quantised)
+    late = (1.0 - fx) * level_at(plane, n, tb, xa, quantised) + fx * level_at(plane, n, tb, xb, quantised)
     return (1.0 - ft) * early + ft * late
 
 
@@ -127,11 +133,9 @@ class Batch:
     emphasis: float  # exponent of the colour over scale in the weight of a texel; 0: none
     periodic: int
     quantised: int  # as in `wlm_kernels.lightmap.blocks`
-
-
-@wp.func
-def draw_state(batch: Batch, n: int, b: int, samples: int) -> wp.uint32:
-    return wp.rand_init(batch.seed + batch.number[n] * 9973, batch.control[0] * samples + b)
+    frozen: int  # whether the maps get no gradients
+    schedule: wp.array1d[wp.vec4]  # [steps] learning rates of maps and networks, and Adam's two corrections
+    rates: wp.array1d[wp.vec4]  # [1] those of this step, written: the launch that uses them also counts the step
 
 
 @wp.struct
@@ -145,8 +149,10 @@ class Sample:
 
 @wp.func
 def draw_sample(batch: Batch, n: int, b: int, samples: int) -> Sample:
-    """Draws random sample b of tile n for this step: a valid texel and a stored time."""
-    state = draw_state(batch, n, b, samples)
+    """Draws random sample b of tile n for this step: a valid texel and a stored time; the first writes rates."""
+    if n == 0 and b == 0:
+        batch.rates[0] = batch.schedule[wp.min(batch.control[0], batch.schedule.shape[0] - 1)]
+    state = wp.rand_init(batch.seed + batch.number[n] * 9973, batch.control[0] * samples + b)
     s = Sample()
     s.flat = batch.texels[n, wp.randi(state, 0, batch.texel_count[n])]
     s.k = wp.randi(state, 0, batch.tau.shape[0])

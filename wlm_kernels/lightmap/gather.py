@@ -1,4 +1,4 @@
-"""Ends a training step: converts the sums of `step` to gradients, and updates the parameters with Adam in one pass.
+"""Ends a training step: converts the sums of `step` to gradients, and updates all parameters with Adam in one launch.
 
 Read `tests/kernels/test_optimiser.py` first; it compares the updates with those of torch's Adam.
 """
@@ -6,6 +6,10 @@ Read `tests/kernels/test_optimiser.py` first; it compares the updates with those
 from typing import Any
 
 import warp as wp
+
+from wlm_kernels.lightmap.blocks import ste_endpoint, ste_weight
+from wlm_kernels.lightmap.features import Offsets
+from wlm_kernels.native import native_source
 
 wp.set_module_options({"enable_backward": False})
 
@@ -16,16 +20,34 @@ def _drain(sums: wp.array2d[float], i: int, clear: int) -> float:
     s = float(0.0)
     for p in range(sums.shape[0]):
         s += sums[p, i]
-        if clear != 0:
+    if clear != 0:  # a loop of its own: reads do not wait for writes
+        for p in range(sums.shape[0]):
             sums[p, i] = 0.0
     return s
 
 
+@wp.func_native(native_source(__package__, "four_at"))
+def _four_at(values: wp.array1d[float], i: int) -> wp.vec4: ...
+
+
+@wp.func_native(native_source(__package__, "put_four"))
+def _put_four(values: wp.array1d[float], i: int, v: wp.vec4): ...
+
+
+@wp.func_native(native_source(__package__, "take_four"))
+def _take_four(sums: wp.array2d[wp.int64], i: int) -> wp.vec4: ...
+
+
 @wp.func
-def _drain(sums: wp.array2d[wp.int64], i: int, clear: int) -> float:
-    s = float(sums[0, i]) * 9.094947017729282e-13  # steps of 2^-40, as `adjoint` adds them
-    sums[0, i] = wp.int64(0)
-    return s
+def _drain_four(sums: wp.array2d[float], i: int) -> wp.vec4:
+    return wp.vec4(
+        _drain(sums, 4 * i, 1), _drain(sums, 4 * i + 1, 1), _drain(sums, 4 * i + 2, 1), _drain(sums, 4 * i + 3, 1)
+    )
+
+
+@wp.func
+def _drain_four(sums: wp.array2d[wp.int64], i: int) -> wp.vec4:
+    return _take_four(sums, i) * 9.094947017729282e-13  # steps of 2^-40, as `adjoint` adds them
 
 
 @wp.struct
@@ -39,146 +61,106 @@ class Adam:
 
 
 @wp.func
-def moved(adam: Adam, i: int, value: float, grad: float, rate: float, corrections: wp.vec2) -> float:
-    """Returns parameter i, now `value`, after Adam's step t, and updates its moments. `corrections` are
-    1 / (1 - decay[0]^t) and 1 / sqrt(1 - decay[1]^t), since the moments began at 0."""
-    first = adam.decay[0] * adam.first[i] + (1.0 - adam.decay[0]) * grad
-    second = adam.decay[1] * adam.second[i] + (1.0 - adam.decay[1]) * grad * grad
-    adam.first[i] = first
-    adam.second[i] = second
-    return value - rate * corrections[0] * first / (wp.sqrt(second) * corrections[1] + adam.epsilon)
+def _moved(state: wp.vec3, grad: float, decay: wp.vec2, epsilon: float, rate: float, corrections: wp.vec2) -> wp.vec3:
+    """Returns a parameter and its two moments after Adam's step t. `corrections` are 1 / (1 - decay[0]^t) and
+    1 / sqrt(1 - decay[1]^t), since the moments began at 0."""
+    m = decay[0] * state[1] + (1.0 - decay[0]) * grad
+    v = decay[1] * state[2] + (1.0 - decay[1]) * grad * grad
+    return wp.vec3(state[0] - rate * corrections[0] * m / (wp.sqrt(v) * corrections[1] + epsilon), m, v)
+
+
+@wp.func
+def _move(values: wp.array1d[float], adam: Adam, i: int, grad: float, rate: float, corrections: wp.vec2):
+    old = wp.vec3(values[i], adam.first[i], adam.second[i])
+    new = _moved(old, grad, adam.decay, adam.epsilon, rate, corrections)
+    values[i] = new[0]
+    adam.first[i] = new[1]
+    adam.second[i] = new[2]
 
 
 @wp.kernel
-def _update_maps(
+def _update(
     # in:
-    schedule: wp.array1d[wp.vec3],
-    first_rates: wp.vec2,
-    control: wp.array1d[int],
-    move: int,
+    levels: int,
     base: int,
+    clear: int,
+    rates: wp.array1d[wp.vec4],
+    offsets: Offsets,
     # in and out:
     acc: wp.array2d[Any],
     adam: Adam,
-    parameters: wp.array1d[float],
+    maps: wp.array1d[float],
+    partial: wp.array2d[float],
+    adam_hidden: Adam,
+    hidden: wp.array1d[float],
+    partial_out: wp.array2d[float],
+    adam_out: Adam,
+    output: wp.array1d[float],
+    loss: wp.array2d[float],
+    mean_loss: wp.array1d[float],
+    control: wp.array1d[int],
     # out:
-    rates: wp.array1d[float],
+    rounded: wp.array1d[float],
 ):
-    i = base + wp.tid()
-    now = schedule[wp.min(control[0], schedule.shape[0] - 1)]
-    g = _drain(acc, i, 1)
-    value = wp.clamp(parameters[i], 0.0, 1.0)
-    if move != 0:
-        value = moved(adam, i, value, g, now[0] * first_rates[0], wp.vec2(now[1], now[2]))
-    parameters[i] = value
-    if i == 0:
-        rates[0] = now[0] * first_rates[0]
-        rates[1] = now[0] * first_rates[1]
-        rates[2] = now[1]
-        rates[3] = now[2]
+    # Networks come first: their sums take longest.
+    t = base + wp.tid()
+    now = rates[0]
+    corrections = wp.vec2(now[2], now[3])
+    if t == 0:
+        control[0] = control[0] + 1
+    if t < hidden.shape[0]:
+        _move(hidden, adam_hidden, t, _drain(partial, t, clear), now[1], corrections)
+        return
+    t -= hidden.shape[0]
+    if t < output.shape[0]:
+        _move(output, adam_out, t, _drain(partial_out, t, clear), now[1], corrections)
+        return
+    t -= output.shape[0]
+    if t < mean_loss.shape[0]:
+        mean_loss[t] += (_drain(loss, t, clear) - mean_loss[t]) * 0.02
+        return
+    t -= mean_loss.shape[0]
+    # All reads come before the first write, for which they would wait.
+    value = _four_at(maps, t)
+    first = _four_at(adam.first, t)
+    second = _four_at(adam.second, t)
+    grad = _drain_four(acc, t)
+    for c in range(4):
+        old = wp.vec3(wp.clamp(value[c], 0.0, 1.0), first[c], second[c])
+        new = _moved(old, grad[c], adam.decay, adam.epsilon, now[0], corrections)
+        value[c] = new[0]
+        first[c] = new[1]
+        second[c] = new[2]
+    _put_four(maps, t, value)
+    _put_four(adam.first, t, first)
+    _put_four(adam.second, t, second)
+    at = 4 * t
+    if levels != 0 and at < offsets.ut:
+        if at < offsets.uv_weights or (at >= offsets.uvt_endpoints and at < offsets.uvt_weights):
+            _put_four(rounded, t, ste_endpoint(value, 1))
+        else:
+            for c in range(4):
+                value[c] = ste_weight(value[c], 1)
+            _put_four(rounded, t, value)
 
 
 # Both forms are compiled with the module: the threads of a fit on the CPU would compile one at the same time.
 for _scalar in (float, wp.int64):
-    wp.overload(_update_maps, {"acc": wp.array2d[_scalar]})
+    wp.overload(_update, {"acc": wp.array2d[_scalar]})
 
 
-@wp.func
-def toward(mean: float, value: float) -> float:
-    """Returns a running mean over about 50 steps, updated with a new value."""
-    return mean + (value - mean) * 0.02
-
-
-@wp.kernel
-def _update_net(
-    # in:
-    rates: wp.array1d[float],
-    clear: int,
-    # in and out:
-    partial: wp.array2d[float],
-    partial_out: wp.array2d[float],
-    loss: wp.array2d[float],
-    adam: Adam,
-    adam_out: Adam,
-    hidden: wp.array1d[float],
-    output: wp.array1d[float],
-    mean_loss: wp.array1d[float],
-    control: wp.array1d[int],
-):
-    i = wp.tid()
-    corrections = wp.vec2(rates[2], rates[3])
-    if i < hidden.shape[0]:
-        hidden[i] = moved(adam, i, hidden[i], _drain(partial, i, clear), rates[1], corrections)
-    if i < output.shape[0]:
-        output[i] = moved(adam_out, i, output[i], _drain(partial_out, i, clear), rates[1], corrections)
-    if i < mean_loss.shape[0]:
-        mean_loss[i] = toward(mean_loss[i], _drain(loss, i, clear))
-    if i == 0:
-        control[0] = control[0] + 1
-
-
-def update_maps(
-    schedule: wp.array,
-    first_rates: tuple[float, float],
-    control: wp.array,
-    move: bool,
-    acc: wp.array,
-    adam: Adam,
-    parameters: wp.array,
-    rates: wp.array,
-    base: int = 0,
-    count: int | None = None,
+def update(
+    *arguments: Any, frozen: bool = False, levels: bool = False, clear: bool, lane: int = 0, lanes: int = 1
 ) -> None:
-    """Converts the maps' sums into gradients and updates the maps with Adam: the first half of a step's update.
+    """Converts sums into gradients, updates the parameters with Adam and running means of losses, and counts the step.
 
     Args:
-        schedule: vec3 [steps]: the factor on the initial learning rates, and Adam's two corrections, see `moved`.
-        first_rates: The initial learning rates of the maps and of the networks.
-        control: int [1], number of the step.
-        move: Whether Adam updates the maps; they are clamped in any case.
-        acc: The sums for the M parameters, as `StepKernels.launch` adds them; set to 0.
-        adam: State of the optimiser, updated.
-        parameters: float [M], the maps; clamped to [0, 1], then updated.
-        rates: float [4], written with parameter 0: the learning rates of maps and networks at this step, and Adam's
-            two corrections.
-        base, count: First index and number of the parameters that this launch updates; default all.
+        arguments: Those of `_update` in its order. Sums are as `StepKernels.launch` adds them, those of maps are set to
+            0; `maps` are clamped to [0, 1], then updated; `rounded` gets their levels in the file.
+        frozen, levels, clear: Whether only networks are updated, `rounded` is written, networks' sums are set to 0.
+        lane, lanes: This launch updates one of so many parts of all parameters.
     """
-    wp.launch(
-        _update_maps,
-        parameters.shape[0] - base if count is None else count,
-        inputs=[schedule, wp.vec2(*first_rates), control, int(move), base, acc, adam, parameters],
-        outputs=[rates],
-        device=parameters.device,
-    )
-
-
-def update_net(
-    partial: wp.array,
-    partial_out: wp.array,
-    loss: wp.array,
-    rates: wp.array,
-    adam: Adam,
-    adam_out: Adam,
-    hidden: wp.array,
-    output: wp.array,
-    mean_loss: wp.array,
-    control: wp.array,
-) -> None:
-    """Converts the networks' sums into gradients and updates the networks with Adam: ends a step's update.
-
-    Args:
-        partial, partial_out, loss: Sums of P threads or blocks for hidden and output layers and losses, float [P, ...];
-            set to 0 on the CPU, whose next step adds to them.
-        rates: As `update_maps` wrote them.
-        adam, adam_out: States of the optimisers of hidden and output layers, updated.
-        hidden, output: float, the hidden and output layers, updated.
-        mean_loss: float [N], running mean of each tile's loss, updated.
-        control: int [1], number of the step; increased by 1.
-    """
-    clear, sums = int(partial.device.is_cpu), (partial, partial_out, loss)
-    wp.launch(
-        _update_net,
-        max(hidden.shape[0], output.shape[0], mean_loss.shape[0]),
-        inputs=[rates, clear, *sums, adam, adam_out, hidden, output, mean_loss, control],
-        device=partial.device,
-    )
+    maps, hidden, output, mean_loss = (arguments[i] for i in (4, 7, 10, 12))
+    total = hidden.shape[0] + output.shape[0] + mean_loss.shape[0] + (0 if frozen else maps.shape[0] // 4)
+    first, last = (min(total, each * -(-total // lanes)) for each in (lane, lane + 1))
+    wp.launch(_update, last - first, inputs=[int(levels), first, int(clear), *arguments], device=maps.device)

@@ -2,7 +2,7 @@
 
 It handles B random samples of each of N tiles (neural-dynamic-gi, section 3.3, 3.4 and 4): draws a valid texel and a
 time, samples F_uv, F_uvt, F_ut and F_vt, adds the uniform noise of eq. 6, centres the features, runs the network,
-computes the weighted squared error and sums the gradients. `gather` turns the sums into gradient arrays.
+computes the weighted squared error and sums the gradients. `gather` turns the sums into gradients.
 
 On CUDA, networks run on the matrix units in half floats (`matrix_step`), on the CPU in float32.
 
@@ -237,7 +237,8 @@ def step_kernels(hidden: int, gelu: str, device_kind: str) -> StepKernels:
                 partial_out[lane, n, c] += d3 * h2[c]
             partial[lane, n, wp.static(columns_2 + units)] += d2
             partial_out[lane, n, wp.static(units)] += d3
-            scatter(acc, lane, offsets, maps, batch, n, sample, back_input(hidden, n, d1))
+            if batch.frozen == 0:
+                scatter(acc, lane, offsets, maps, batch, n, sample, back_input(hidden, n, d1))
 
     else:
         network = matrix_network(hidden, gelu)
@@ -272,6 +273,7 @@ def step_kernels(hidden: int, gelu: str, device_kind: str) -> StepKernels:
             g = vec_in()
             for c in range(wp.static(INPUTS)):
                 g[c] = r[c]
-            scatter(acc, 0, offsets, maps, batch, n, sample, g)
+            if batch.frozen == 0:
+                scatter(acc, 0, offsets, maps, batch, n, sample, g)
 
     return StepKernels(net, scalar, draw, step)
