@@ -76,8 +76,8 @@ class Lines:
         return found
 
 
-def _atlas(pattern: str) -> Curve:
-    return Curve("nvidia-h200", "atlas", "mean over 18 lightmaps", pattern)
+def _atlas(pattern: str, file: str = "nvidia-h200") -> Curve:
+    return Curve(file, "atlas", "mean over 18 lightmaps", pattern)
 
 
 def _sweep(setting: str) -> Curve:
@@ -105,7 +105,7 @@ PLOTS: dict[str, Lines] = {
         {
             "ours": _atlas("ours standard(, CR .*)?"),
             "ours, bc6h": _atlas("ours bc6h"),
-            "ours, astc": _atlas("ours astc"),
+            "ours, astc": _atlas("ours astc", "cpu"),
             "ours, cascade": _atlas("ours cascade"),
             "ASTC": _atlas("ASTC bits of standard.*"),
             "BC6H, our encoder": _atlas("BC6H, our encoder bits of standard.*"),
