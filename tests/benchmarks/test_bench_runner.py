@@ -149,7 +149,8 @@ def test_pages_by_system(tmp_path, monkeypatch):
     """A page has the row of a method and option that has most figures, and the command that measured it."""
     monkeypatch.chdir(tmp_path)
     write_json("a.json", [OURS], ENVIRONMENT)
-    frame = Row("smoke-network", "unseen smoke", "time against error", "coarse, h 2", {"psnr": 50.0, "time_ms": 1.0})
+    scene = "plume, 128³, 256² pixels"
+    frame = Row("smoke-network", scene, "coarse march", "step 2", {"psnr": 50.0, "time_ms": 1.0})
     write_json("a.json", [frame, replace(frame, scene="another")], ENVIRONMENT)
     write_json("b.json", [OURS.with_figures(seen=40.0)], ENVIRONMENT | {"device_name": ""})
     made = pages(["a.json", "b.json"], "docs/all.md")
@@ -161,7 +162,7 @@ def test_pages_by_system(tmp_path, monkeypatch):
     assert "| ours | M | b | 1,234,567 | 0.676 | 42.50 | 40.00 |" in lightmap and "| ours | M | a |" not in lightmap
     assert "- `python -m benchmarks --json b.json`: cpu, 1 threads, Python 3, Warp 1, torch 2, 2026-01-02" in lightmap
     assert (
-        "| time against error | coarse, h 2 | a | 50.00 | 1 |" in made["all/smoke.md"]
+        "| coarse march | step 2 | a | 1 | 50.00 |" in made["all/smoke.md"]
         and "another" not in made["all/smoke.md"]
     )
     write_json("c.json", [replace(OURS, option=str(i)) for i in range(90)], ENVIRONMENT)
