@@ -26,11 +26,13 @@ struct Place {
 struct Gelu {
     static __device__ float gate(float x) {
         if (EXACT) return 0.5f + 0.5f * erff(x * 0.7071067811865476f);
-        return __fdividef(1.0f, 1.0f + __expf(x * (-1.5957691216057308f - 0.07135481627260025f * x * x)));
+        float y;
+        asm("tanh.approx.f32 %0, %1;" : "=f"(y) : "f"(x * (0.7978845608028654f + 0.035677408136300125f * (x * x))));
+        return 0.5f + 0.5f * y;
     }
     static __device__ float slope(float x, float gate) {
         if (EXACT) return gate + x * 0.3989422804014327f * __expf(-0.5f * x * x);
-        return gate + 2.0f * x * gate * (1.0f - gate) * (0.7978845608028654f + 0.10703222440890037f * x * x);
+        return gate + (gate - gate * gate) * (x * (1.5957691216057308f + 0.21406444881780074f * (x * x)));
     }
 };
 __shared__ __align__(16) unsigned short inputs[T * 16], w2[H * STRIDE], both[2 * T * STRIDE];
@@ -52,8 +54,10 @@ const float* o = reinterpret_cast<const float*>(output.data) + size_t(n) * (H + 
 
 // Weights, and the sample's inputs.
 const auto load_weights = [&](unsigned short* to, const float* from, int rows, int filled) {
-    for (int i = t; i < rows * H / 4; i += T) {
-        const int r = i / (H / 4), column = i % (H / 4) * 4;
+    #pragma unroll
+    for (int j = 0; j < (rows * H / 4 + T - 1) / T; ++j) {
+        const int i = t + j * T, r = i / (H / 4), column = i % (H / 4) * 4;
+        if (i >= rows * H / 4) break;
         float4 v = make_float4(0.0f, 0.0f, 0.0f, 0.0f);
         if (r < filled) v = *reinterpret_cast<const float4*>(from + r * H + column);
         *reinterpret_cast<uint2*>(to + Place::at(r, column >> 3) + (column & 4)) =
@@ -367,9 +371,10 @@ for (int m = 0; m < 2; ++m)
             *reinterpret_cast<float2*>(passed + (first + 16 * m + 8 * r + g) * WIDE + 8 * j + 2 * q) =
                 make_float2(on_inputs[m][j][2 * r], on_inputs[m][j][2 * r + 1]);
 __syncwarp();
-wp::vec_t<I + 3, float> result;
+wp::vec_t<I + 4, float> result;
 #pragma unroll
 for (int c = 0; c < I; ++c) result.c[c] = passed[t * WIDE + c] * back;
 #pragma unroll
 for (int c = 0; c < 3; ++c) result.c[I + c] = error[c];
+result.c[I + 3] = static_cast<float>(__cvta_generic_to_shared(passed + t * WIDE));
 return result;
