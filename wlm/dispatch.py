@@ -137,16 +137,10 @@ def run(
     """Runs tasks by workers, see `start_workers`, of a class that has the methods of `Whole`.
 
     Tasks begin in their order. Those of lost workers begin again, and `meter` reports the progress, with `done` steps
-    before. The checkpoint has the states of running tasks; the caller adds results, which are written when the work
-    is stopped.
-
-    Yields:
-        Each finished task with its result.
-
-    Raises:
-        WlmError: A task failed, a saved state is wrong, or the workers of a task died again and again.
-        KeyboardInterrupt: Raised by the progress callback; the states of running tasks have been saved.
-    """
+    before. The checkpoint has the states of running tasks; the caller adds results, which are written when the work is
+    stopped. Yields each finished task with its result. Raises a WlmError if a task failed, a saved state is wrong, or
+    the workers of a task died again and again. Raises the KeyboardInterrupt of the progress callback, once the states
+    of running tasks have been saved."""
     if tasks:
         try:
             with closing(start_workers(worker, place, len(tasks))) as pool:

@@ -33,10 +33,7 @@ def available_devices() -> list[str]:
 
 def check_device(name: str) -> str:
     """Checks that the device "cpu", "cuda" (the first GPU) or "cuda:N" exists, without falling back to another one.
-
-    Returns:
-        The name that both Warp and torch accept: "cpu" or "cuda:N".
-    """
+    Returns the name that both Warp and torch accept: "cpu" or "cuda:N"."""
     full_name = "cuda:0" if name == "cuda" else name
     devices = available_devices()
     if full_name not in devices:

@@ -287,12 +287,9 @@ class LostLight:
         self.worst: tuple[float, float, str] | None = None
 
     def add(self, reference: np.ndarray | torch.Tensor, decoded: np.ndarray | torch.Tensor, where: str = "") -> None:
-        """Adds a group of points, such as a tile at one time of day or a whole probe set.
-
-        Args:
-            reference, decoded: [K, C], on one device; a point's light is the largest magnitude of its channels.
-            where: Name of the group in the warning.
-        """
+        """Adds a group of points, such as a tile at one time of day or a whole probe set. `reference` and `decoded` are
+        [K, C], on one device; a point's light is the largest magnitude of its channels. `where` is the name of the
+        group in the warning."""
         if not len(reference):
             return
         reference, decoded = torch.as_tensor(reference), torch.as_tensor(decoded)
@@ -312,12 +309,8 @@ class LostLight:
                 self.hidden += off
 
     def warnings(self, name: str, point: str, group: str) -> list[str]:
-        """Returns one line for each kind of loss that occurred.
-
-        Args:
-            name: Name of the compressed data.
-            point, group: Words for a point and for its group, such as "texel" and "its tile".
-        """
+        """Returns one line for each kind of loss that occurred. `name` is the name of the compressed data. `point` and
+        `group` are words for a point and for its group, such as "texel" and "its tile"."""
         lines = []
         if self.worst is not None:
             light, kept, where = self.worst
@@ -470,12 +463,8 @@ def evaluate_frame(
 
 
 def summarise(frames: Sequence[FrameMetrics], times: Sequence[float] | np.ndarray | None = None) -> Summary:
-    """Averages the scores of a scene's lightmaps over all tiles and lightmaps.
-
-    Args:
-        frames: The scores of each lightmap, in order of time.
-        times: The time of each lightmap; None: 0, 1, 2 and so on.
-    """
+    """Averages the scores of a scene's lightmaps over all tiles and lightmaps. `frames` are the scores of each
+    lightmap, in order of time. `times` has the time of each lightmap; None: 0, 1, 2 and so on."""
     if not frames:
         raise WlmError("summarise: expected at least one lightmap's metrics")
     first = frames[0]

@@ -192,11 +192,7 @@ class Model:
     DECODER: ClassVar[tuple[str, str]] = ("decode", "Decoder")
 
     def save(self, path: str | os.PathLike[str]) -> int:
-        """Writes the model to one file, whole or not at all.
-
-        Returns:
-            The file's size, bytes.
-        """
+        """Writes the model to one file, whole or not at all. Returns the file's size in bytes."""
         try:
             settings, parts, source = self._encoded()
         except WlmError as error:

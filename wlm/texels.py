@@ -133,11 +133,8 @@ def _nearest_in_strips(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None
 
 
 def doubts(light: np.ndarray) -> list[str]:
-    """Compares the range of a lightmap [H, W, 3] with what radiance usually is, on some of its texels.
-
-    Returns:
-        One line for each reason why the values may be something else: another unit, an exposure, or screen colours.
-    """
+    """Compares the range of a lightmap [H, W, 3] with what radiance usually is, on some of its texels. Returns one line
+    for each reason why the values may be something else: another unit, an exposure, or screen colours."""
     step = max(1, round((light.size / _SAMPLES) ** 0.5))
     used = light[::step, ::step].reshape(-1, 3)
     red, green, blue = used.T

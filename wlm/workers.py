@@ -123,12 +123,8 @@ class Processes(Workers):
     """
 
     def __init__(self, make: type, arguments: list[tuple[Any, ...]]) -> None:
-        """Starts the processes.
-
-        Args:
-            make: The class of the workers, from an importable module.
-            arguments: Constructor arguments of each worker.
-        """
+        """Starts the processes. `make` is the class of the workers, from an importable module. `arguments` are the
+        constructor arguments of each worker."""
         self.count = len(arguments)
         self._make, self._arguments = make, arguments
         self._answers: queue.SimpleQueue[tuple[int, Any]] = queue.SimpleQueue()

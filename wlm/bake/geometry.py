@@ -179,10 +179,7 @@ def unwrap(
     document: GltfDocument, primitives: Sequence[GltfPrimitive], settings: LightmapSettings
 ) -> list[Replacement]:
     """Creates UVs in one unit square for all primitives together; UV areas are proportional to areas in the world.
-
-    Returns:
-        A replacement for each primitive that has a triangle with area, its UVs in [0, 1].
-    """
+    Returns a replacement for each primitive that has a triangle with area, its UVs in [0, 1]."""
     uvunwrap = need("uvunwrap", "bake")
     meshes, kept = [], []
     for each in primitives:

@@ -310,13 +310,8 @@ def vertex_colours(
     document: GltfDocument, primitives: Sequence[GltfPrimitive], textured: bool = False
 ) -> list[np.ndarray]:
     """Returns the base colours of vertices: `COLOR_0`, or white without it, times the factor of the material.
-
-    Args:
-        textured: Whether materials may have a texture, by which the caller multiplies the colours.
-
-    Returns:
-        For each primitive float32 [V, 3], linear, from 0 to 1.
-    """
+    `textured` tells whether materials may have a texture, by which the caller multiplies the colours. Returns for each
+    primitive float32 [V, 3], linear, from 0 to 1."""
     with reported(document.path):
         colours = []
         for each in primitives:

@@ -359,11 +359,8 @@ class _Tree:
 
 
 def leaf_array(low: np.ndarray, high: np.ndarray, most: int, where: str) -> tuple[np.ndarray, np.ndarray]:
-    """Allocates the whole leaves around a box of voxels from `low` [3] up to but without `high` [3].
-
-    Returns:
-        Uninitialised values, float32 [X, Y, Z], and their first voxel [3].
-    """
+    """Allocates the whole leaves around a box of voxels from `low` [3] up to but without `high` [3]. Returns
+    uninitialised values, float32 [X, Y, Z], and their first voxel [3]."""
     first = low // LEAF * LEAF
     shape = -(-(high - first) // LEAF) * LEAF
     if not (low.min() >= -_FARTHEST and high.max() <= _FARTHEST and math.prod(shape.tolist()) <= most):

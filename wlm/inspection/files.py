@@ -70,10 +70,7 @@ _MOST_NAMES = 8  # names that one line lists
 
 def kind_of(path: Path) -> str:
     """Finds the kind of a file from its first bytes, its suffix, or the names inside it; reads no large part of it.
-
-    Returns:
-        A key of the table of kinds, "" if the kind is unknown.
-    """
+    Returns a key of the table of kinds, "" if the kind is unknown."""
     with open_file(path, "the file") as file:
         head = file.read(VOLUME_HEAD)
     if is_volume(head):

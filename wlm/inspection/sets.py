@@ -73,10 +73,8 @@ def assumed(listing: Listing) -> list[str]:
 
 def together(files: Sequence[Path], heads: Sequence[Picture | None]) -> tuple[list[str], str]:
     """Checks whether pictures are one lightmap at several times, from all headers and the texels of at most eight.
-
-    Returns:
-        The problems, one line each, and the common size, such as "512x256"; "" if the pictures are not one lightmap.
-    """
+    Returns the problems, one line each, and the common size, such as "512x256"; "" if the pictures are not one
+    lightmap."""
     for file, head in zip(files, heads, strict=True):
         if head is None or not head.is_light:
             raise WlmError(f"{file.name}: expected a picture of light, found a file of another kind")

@@ -458,14 +458,9 @@ def at_times(times: np.ndarray, wanted: np.ndarray) -> np.ndarray:
 def parse_times(text: str) -> list[float]:
     """Reads a list of times: numbers and `start:stop:step` ranges, separated by commas.
 
-    A range leaves `stop` out, as in Python: "0:24:1" is 0, 1, ... 23, one day without its first hour twice.
-
-    Args:
-        text: Such as "0,1,2.5", "0:24:1" or "0:18:1,18.45,18.55,19:24:1".
-
-    Returns:
-        The times in the order written, at least one.
-    """
+    A range leaves `stop` out, as in Python: "0:24:1" is 0, 1, ... 23, one day without its first hour twice. `text` is a
+    list such as "0,1,2.5", "0:24:1" or "0:18:1,18.45,18.55,19:24:1". Returns the times in the order written, at least
+    one."""
     times: list[float] = []
     for part in text.split(","):
         try:

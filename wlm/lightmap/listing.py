@@ -129,11 +129,8 @@ def list_set(
     stored: str | None = None,
     groups: Mapping[str, Path] | None = None,
 ) -> dict[str, Listing]:
-    """Lists the files of a set, by the rules that `wlm.lightmap.load` describes. `stored` is its `encoding`.
-
-    Returns:
-        A listing for each light group; for a set that names none, one of the name `BASE`.
-    """
+    """Lists the files of a set, by the rules that `wlm.lightmap.load` describes. `stored` is its `encoding`. Returns a
+    listing for each light group; for a set that names none, one of the name `BASE`."""
     found = _listings(path, times, layers, trust, stored is not None)
     for name, own in (groups or {}).items():
         if not is_group(name) or name in found:

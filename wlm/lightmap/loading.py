@@ -121,11 +121,8 @@ class TileLoader:
             return taken
 
     def wait(self, seconds: float | None = None) -> bool:
-        """Waits until a result can be taken, or nothing waits any more, at most some seconds.
-
-        Returns:
-            Whether a result can be taken.
-        """
+        """Waits until a result can be taken, or nothing waits any more, at most some seconds. Returns whether a result
+        can be taken."""
         with self._change:
             self._change.wait_for(lambda: self._results or not (self._waiting or self._current), seconds)
             return bool(self._results)

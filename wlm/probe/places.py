@@ -61,11 +61,8 @@ def probes_of(
 
 
 def positions_of(model: ProbeModel, original: str | os.PathLike[str] | None) -> np.ndarray | None:
-    """Reads the positions of a model's probes from another file, float64 [N, 3]; None if no file is given.
-
-    Raises:
-        WlmError: The file cannot be read or has other probes.
-    """
+    """Reads the positions of a model's probes from another file, float64 [N, 3]; None if no file is given. Raises a
+    WlmError if the file cannot be read or has other probes."""
     if original is None:
         return None
     position = load_positions(original)

@@ -324,11 +324,7 @@ class Body(_Settings):
 
     @property
     def surface(self) -> Surface | None:
-        """The surface in the mesh file; None for other shapes.
-
-        Raises:
-            WlmError: The file cannot be read.
-        """
+        """The surface in the mesh file; None for other shapes. Raises a WlmError if the file cannot be read."""
         return None if self.shape in _SIZES else read_surface(self.shape)
 
     def half_extents(self, edge: float) -> np.ndarray:
@@ -585,12 +581,8 @@ class Scene(_Settings):
     def scaled(self, factor: float) -> Scene:
         """Returns the scene with its number of cells along each axis multiplied by a factor and rounded, at least 1.
 
-        The length of the longest axis stays the same; other axes change by at most half a cell.
-
-        Raises:
-            ValueError: The factor is not above 0.
-            WlmError: There are too many cells.
-        """
+        The length of the longest axis stays the same; other axes change by at most half a cell. Raises a ValueError if
+        the factor is not above 0. Raises a WlmError if there are too many cells."""
         if not 0 < factor < math.inf:
             raise ValueError(f"factor: expected a number above 0, got {factor}")
         cells = tuple(max(round(n * factor), 1) for n in self.grid.cells)
@@ -715,10 +707,8 @@ def make_camera(
 
 
 def obstacle_mesh(obstacles: Sequence[ObstacleSettings], time: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns the surfaces of obstacles at a time in seconds as triangles, for their pictures and shadows.
-
-    Returns:
-        Corners float32 [V, 3] in the world, triangles int32 [F, 3], index of each triangle's obstacle int32 [F].
+    """Returns the surfaces of obstacles at a time in seconds as triangles, for their pictures and shadows. These are
+    corners, float32 [V, 3] in the world, triangles, int32 [F, 3], and the index of each triangle's obstacle, int32 [F].
     """
     corners, triangles, owner = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], [np.zeros(0, np.int64)]
     first = 0

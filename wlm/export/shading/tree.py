@@ -299,9 +299,5 @@ class _Reader:
 
 
 def read_shader(words: list[Word]) -> Shader:
-    """Parses the tokens of a shader.
-
-    Raises:
-        ValueError: The text uses GLSL that this parser does not support.
-    """
+    """Parses the tokens of a shader. Raises a ValueError if the text uses GLSL that this parser does not support."""
     return _Reader(words).shader()

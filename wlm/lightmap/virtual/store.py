@@ -543,9 +543,6 @@ def _changes(words: np.ndarray, periodic: bool) -> np.ndarray:
 
 def page_changes(layout: Layout, change: np.ndarray) -> np.ndarray:
     """Adds up the changes of the pages' light, see `wlm_kernels.lightmap.virtual.Pages`, from `TileStore.change`.
-
-    Returns:
-        float32 [P, T + 1]; a page changes as much as the tile below it that changes most.
-    """
+    Returns float32 [P, T + 1]; a page changes as much as the tile below it that changes most."""
     largest = np.stack([change[layout.below(page)].max(0) for page in range(len(layout.parent))])
     return np.concatenate([np.zeros((len(largest), 1)), np.cumsum(largest, 1)], 1).astype(np.float32)
