@@ -31,12 +31,7 @@ if TYPE_CHECKING:
     from wlm.bundle import Bundle
 
 # The package that reads the files of each system.
-_PACKAGES = {
-    "lightmap": "wlm.lightmap",
-    "atlas": "wlm.atlas",
-    "probe": "wlm.probe",
-    "smoke-network": "wlm.smoke",
-}
+_PACKAGES = {"lightmap": "wlm.lightmap", "atlas": "wlm.atlas", "probe": "wlm.probe", "smoke-network": "wlm.smoke"}
 _REPORT_EVERY = 0.5  # seconds between two reports of progress
 
 

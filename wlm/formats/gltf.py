@@ -165,14 +165,6 @@ Arrays = tuple[str, np.ndarray, np.ndarray, np.ndarray]
 """A mesh that came from elsewhere: its name, positions [V, 3], triangles int [F, 3] and UVs [V, 2]."""
 
 
-def document_from_arrays(
-    position: np.ndarray, triangle: np.ndarray, uv: np.ndarray, name: str
-) -> tuple[GltfDocument, GltfPrimitive]:
-    """Makes a glTF document of one mesh from arrays as `Arrays` describes them; returns it with its only primitive."""
-    document, (primitive,) = document_from_meshes([(name, position, triangle, uv)], name)
-    return document, primitive
-
-
 def document_from_meshes(
     meshes: Sequence[Arrays], name: str, uv_set: int = 0
 ) -> tuple[GltfDocument, list[GltfPrimitive]]:

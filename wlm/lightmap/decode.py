@@ -51,12 +51,7 @@ class SheetDecoder:
         device: The device, as `wlm.interop.check_device` returns it.
     """
 
-    def __init__(
-        self,
-        model: SheetModel,
-        device: str = "cpu",
-        tiles: Sequence[int] | np.ndarray | None = None,
-    ) -> None:
+    def __init__(self, model: SheetModel, device: str = "cpu", tiles: Sequence[int] | np.ndarray | None = None) -> None:
         """Uploads a sheet, or only the tiles of some numbers, which alone are read of a sheet of a file."""
         self.device, gelu = device_of(device), model.profile.gelu
         self.model = model if tiles is None else model.only(tiles)

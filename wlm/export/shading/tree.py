@@ -10,18 +10,7 @@ VECTORS = {
 SCALARS = ("float", "int", "uint", "bool", "void")
 SAMPLERS = ("sampler2D", "usampler2D", "sampler2DArray")
 _TYPES = {*VECTORS, *SCALARS, *SAMPLERS}
-LEVELS = (
-    ("||",),
-    ("&&",),
-    ("|",),
-    ("^",),
-    ("&",),
-    ("==", "!="),
-    ("<", ">", "<=", ">="),
-    ("<<", ">>"),
-    ("+", "-"),
-    ("*", "/", "%"),
-)
+LEVELS = tuple(map(str.split, ("||", "&&", "|", "^", "&", "== !=", "< > <= >=", "<< >>", "+ -", "* / %")))
 _ASSIGN = ("=", "+=", "-=", "*=", "/=", "%=", "&=", "|=", "^=")
 
 

@@ -127,14 +127,7 @@ class TileStore:
     """
 
     def __init__(
-        self,
-        model: LightmapModel,
-        layout: Layout,
-        first: int,
-        device: str,
-        gelu: str,
-        room: int | None,
-        clock: Clock,
+        self, model: LightmapModel, layout: Layout, first: int, device: str, gelu: str, room: int | None, clock: Clock
     ) -> None:
         """Reads all tiles and uploads as many as fit into `room` bytes; for the errors see `VirtualTexture`.
 
