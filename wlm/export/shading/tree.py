@@ -28,8 +28,7 @@ class Node:
 class Variable:
     """A parameter, constant, local or shared variable, texture, uniform or buffer of a GLSL type. `size` is the
     length of an array, else None; `way` is `in`, `out` or `inout` of a parameter or local variable, or `const`,
-    `uniform`, `shared`, `buffer` or, of a buffer that is written, `storage`; `value` is the initial value, or None.
-    """
+    `uniform`, `shared`, `buffer` or, of a buffer that is written, `storage`; `value` is the initial value, or None."""
 
     type: str
     name: str
