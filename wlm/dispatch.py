@@ -1,4 +1,4 @@
-"""Hands out the independent tasks of long work to workers: in this process, in other processes, or on a Ray cluster.
+"""Hands out the independent tasks of long work to workers: in this process, its threads, other processes, or a cluster.
 
 The result of a task does not depend on the worker, so the work has the same result for any number of workers, in any
 order of completion, and if workers are lost.
@@ -90,7 +90,8 @@ class Place(NamedTuple):
     Attributes:
         device: "cpu", "cuda" or "cuda:N". Several workers on "cuda" are spread over the GPUs of this machine.
         workers: Number of workers; None: one, on a cluster as many as have room.
-        cluster: Address of a Ray cluster, whose workers take two CPUs or a GPU each; None: processes of this machine.
+        cluster: Address of a Ray cluster, whose workers take two CPUs or a GPU each; None: processes of this machine,
+            or threads for its GPUs, see `Whole`.
     """
 
     device: str = "cpu"

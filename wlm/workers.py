@@ -1,4 +1,4 @@
-"""Parallel work: in threads, or by objects in this process, in other processes of this machine, or on a Ray cluster.
+"""Parallel work: in threads, or by objects in this process or its threads, in other processes, or on a Ray cluster.
 
 Callers submit method calls, one at a time per object, and receive the results in order of completion.
 Processes on this machine use the standard library alone: Ray takes seconds to start, needs 250 MB and leaves log
