@@ -186,11 +186,8 @@ def is_volume(head: bytes) -> bool:
 
 
 def read_ktx2_volume(path: str | os.PathLike[str]) -> np.ndarray:
-    """Reads the largest mip of a 3D texture of light in its stored order, whatever `KTXorientation` states.
-
-    Returns:
-        The texels, float32 [D, H, W, 3]; alpha is left out.
-    """
+    """Reads the largest mip of a 3D texture of light in its stored order, whatever `KTXorientation` states. Returns the
+    texels, float32 [D, H, W, 3]; alpha is left out."""
     return _read(path, True, [])[0][..., :3]
 
 

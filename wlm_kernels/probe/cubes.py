@@ -324,12 +324,8 @@ def build(shapes, low, high, size: float | None = None) -> Cubes:
 
 
 def everything(count: int, device) -> Cubes:
-    """Returns a grid of one cube that lists all Gaussians, for sums without lists.
-
-    Args:
-        count: Number of Gaussians, K.
-        device: Device of the list.
-    """
+    """Returns a grid of one cube that lists all Gaussians, for sums without lists. `count` is K, the number of
+    Gaussians."""
     cubes = _grid(np.zeros((2, 3)), 1.0)
     cubes.start = wp.array([0, count], dtype=int, device=device)
     cubes.item = wp.array(np.arange(count, dtype=np.int32), dtype=int, device=device)
