@@ -17,9 +17,7 @@ from wlm_kernels.native import native_source
 
 
 @wp.func_native(native_source(__package__, "add_fours"))
-def _add_fours(
-    acc: wp.array2d[wp.int64], row: int, first: int, second: int, a: float, b: float, g: wp.vec4
-):
+def _add_fours(acc: wp.array2d[wp.int64], row: int, first: int, second: int, a: float, b: float, g: wp.vec4):
     """Adds a * g to the sums with the indices `first` to `first` + 3, and b * g to those from `second` on; nothing if
     `first` < 0. All lanes of a warp must call it together; `row` is each lane's address in shared memory."""
 
@@ -43,7 +41,8 @@ def _joined(parts: wp.vec4, in_x: float, in_y: float) -> wp.vec4:
 
 @functools.cache
 def _adders(device_kind: str) -> tuple[Any, ...]:
-    """Returns a function that adds a number, the type of the sums, and functions like `_add_fours` and `_add_corners`."""
+    """Returns a function that adds a number, the type of the sums, and functions like `_add_fours` and
+    `_add_corners`."""
     if device_kind == "cuda":
         # Fixed point with steps of 2^-40, about 1e-12; a sum beyond 8e6 would overflow.
 
@@ -136,7 +135,7 @@ def scatters(device_kind: str) -> tuple[Any, Any, Any, Any]:
             periodic: int,
             g: wp.vec2,
         ):
-            # Both cells of a row are neighbours; beyond the last or before the first one, one of them gets 0.
+            # Two neighbours of a row; beyond its last or before its first cell, the other one gets 0.
             x = cell(p, maps.columns)
             t = cell(tau, maps.rows)
             place = wp.clamp(x, 0, wp.max(maps.columns - 2, 0))

@@ -27,8 +27,8 @@ def matrix_network(hidden: int, gelu: str) -> Any:
     channels; `share`, a factor on every squared error; `row`, the number of this block of samples; and the results,
     written for each block: `partial` [rows * (18 + H), H], `partial_out` [rows * (H + 1), 3] and `loss` [rows].
 
-    It returns the gradient of the inputs of each sample, followed by the error of the output, and the address of 80 bytes
-    of shared memory that are now the sample's own: rows of a warp's lanes follow each other.
+    It returns the gradient of the inputs of each sample, followed by the error of the output, and the address of 80
+    bytes of shared memory that are now the sample's own: rows of a warp's lanes follow each other.
 
     Args:
         hidden: H, the number of hidden units, one of `WIDTHS`.

@@ -83,7 +83,8 @@ class StepKernels:
             output: vec3 [N, H + 1], the output layers.
             batch: The training data.
             samples: B; on CUDA a multiple of `BLOCK`.
-            acc: [lanes, M], gradients of `maps.values`, added to: int64 of one lane on CUDA, float of a lane per CPU thread.
+            acc: [lanes, M], gradients of `maps.values`, added to: int64 of one lane on CUDA, float of a lane for each
+                thread of the CPU.
             partial: float [P, N, 18 + H, H], gradients of the hidden layers: on CUDA of P blocks of `BLOCK` samples,
                 written; on the CPU of P lanes, added to.
             partial_out: float [P, N, H + 1, 3], gradients of the output layers, like `partial`.

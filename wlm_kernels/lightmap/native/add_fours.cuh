@@ -16,10 +16,10 @@
         if ((any >> (4 * r) & 15u) == 0u) continue;
         const float2 each = *reinterpret_cast<const float2*>(from + (own & 4) / 2);
         const int to = __float_as_int(each.x);
-        const long long steps = static_cast<long long>(each.y * from[4 + (own & 3)]);
-        if (to >= 0)
+        const float steps = each.y * from[4 + (own & 3)];
+        if (to >= 0 && steps != 0.0f)  // beyond the last cell of the last row is no sum
             atomicAdd(reinterpret_cast<unsigned long long*>(acc.data + to + (own & 3)),
-                      static_cast<unsigned long long>(steps));
+                      static_cast<unsigned long long>(static_cast<long long>(steps)));
     }
     __syncwarp();
 #endif
