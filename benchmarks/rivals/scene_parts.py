@@ -87,7 +87,7 @@ def _compressed(
 ) -> SceneParts:
     tiles, parts = _cut(scene, weights, profile, device)
     sizes = sizes_of(profile)
-    error = torch.from_numpy(curves(tiles, sizes, Stages(device)))
+    error = curves(tiles, sizes, Stages(device))
     share, tries = bits / (scene.texels * SOURCE_BITS), []
     for _ in range(_TRIES):
         placed = [_placed(error[:, part.tiles], sizes, part, share, profile) for part in parts]

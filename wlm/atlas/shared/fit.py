@@ -14,7 +14,7 @@ than with each state compressed alone.
 import numpy as np
 import torch
 
-from wlm.atlas.colour import encode, quantise
+from wlm.atlas.colour import quantise
 from wlm.atlas.data import LightmappedScene
 from wlm.atlas.model import BLOCK_SIDE, BLOCKS, TEXELS, AtlasModel, Profile, coarse_place, extent, pack_tiles
 from wlm.atlas.shared.allocation import Allocated
@@ -125,10 +125,10 @@ def _textures(tiles: SceneTiles, tried: list[Candidate], given: Allocated) -> tu
     scale = np.divide(_BRIGHT, largest, out=np.ones_like(largest), where=largest > 0)
     first, second = (texels * scale[number] for texels, number in zip(light, owner, strict=True))
     textures = quantise(first, TEXELS, device=tiles.device)
-    pages = [encode(page, BLOCKS, weight, tiles.device) for page, weight in zip(second, share[1], strict=True)]
+    pages = [quantise(page, BLOCKS, weight, tiles.device) for page, weight in zip(second, share[1], strict=True)]
     if pages:
-        blocks, decoded = (np.stack(each) for each in zip(*pages, strict=True))
-        textures |= {"blocks": blocks, "block_texels": decoded}
+        names = {"blocks": "blocks", "block_texels": "texels"}
+        textures |= {name: np.stack([page[part] for page in pages]) for name, part in names.items()}
     return textures, scale.astype(np.float64)
 
 
