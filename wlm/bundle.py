@@ -37,22 +37,7 @@ INDEX_FILE = "bundle.json"
 FORMAT = "wlm-bundle"
 """`format` of these indexes."""
 
-RESERVED = frozenset(
-    (
-        "format",
-        "version",
-        "system",
-        "name",
-        "engine",
-        "shader",
-        "compute",
-        "textures",
-        "buffers",
-        "reference",
-        "files",
-        "parts",
-    )
-)
+RESERVED = frozenset("format version system name engine shader compute textures buffers reference files parts".split())
 """Keys of an exported index that `wlm.export` fills in; a document must not have them."""
 
 _MARK = re.compile(r"@(\w+)@")

@@ -21,8 +21,7 @@ def printable(text: str) -> str:
 
 def one_line(text: object, limit: int = _LIMIT) -> str:
     """Joins the lines of a message, escapes control characters, and truncates the result to `limit` characters, "..."
-    at its end.
-    """
+    at its end."""
     line = printable(" ".join(part.strip() for part in str(text).splitlines() if part.strip()))
     return line if len(line) <= limit else line[: limit - 3].rstrip() + "..."
 

@@ -31,12 +31,7 @@ if TYPE_CHECKING:
     from wlm.bundle import Bundle
 
 # The package that reads the files of each system.
-_PACKAGES = {
-    "lightmap": "wlm.lightmap",
-    "atlas": "wlm.atlas",
-    "probe": "wlm.probe",
-    "smoke-network": "wlm.smoke",
-}
+_PACKAGES = {"lightmap": "wlm.lightmap", "atlas": "wlm.atlas", "probe": "wlm.probe", "smoke-network": "wlm.smoke"}
 _REPORT_EVERY = 0.5  # seconds between two reports of progress
 
 
@@ -67,8 +62,7 @@ class Settings(BaseModel):
     @classmethod
     def load(cls, profile: str | os.PathLike[str] | Self) -> Self:
         """Loads a profile by its name (NAME in `configs/FILES-NAME.yaml`; `FILES` is the class's) or the path of a YAML
-        file; an instance is returned unchanged.
-        """
+        file; an instance is returned unchanged."""
         if isinstance(profile, cls):
             return profile
         path = os.fspath(profile)
@@ -90,14 +84,9 @@ class Settings(BaseModel):
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a long computation has come.
-
-    Attributes:
-        stage: Name of the current stage in a word or two, such as "fit" or "cluster".
-        done, total: Finished steps and all steps of the stage; a total of 0 is unknown.
-        seconds: Time since the work began, seconds.
-        figures: Measured values so far by name and unit, such as `{"PSNR dB": 41.2}`. NaN is unknown.
-    """
+    """How far a long computation has come, `seconds` after it began. `stage` names the current stage in a word or two,
+    such as "fit" or "cluster"; `done` and `total` are its finished steps and all its steps, 0 if unknown. `figures` are
+    values measured so far by name and unit, such as `{"PSNR dB": 41.2}`; NaN is unknown."""
 
     stage: str
     done: int
@@ -112,17 +101,11 @@ stops between two steps."""
 
 
 class Meter:
-    """Reports progress about twice a second.
-
-    Attributes:
-        stage: Name of the stage.
-        seconds: Time since the work began, seconds.
-    """
+    """Reports progress about twice a second. `stage` names the stage, `seconds` is the time since the work began."""
 
     def __init__(self, progress: OnProgress | None, stage: str, total: int, every: float = _REPORT_EVERY) -> None:
         """Starts the clock; `every` is the number of seconds between two reports, and without a callback there are
-        none.
-        """
+        none."""
         self._progress, self.stage, self._total, self._every = progress, stage, total, every
         self._start = self._last = time.perf_counter()
 

@@ -58,12 +58,8 @@ def each(call: Callable[[_Item], _Answer], items: Iterable[_Item]) -> Iterator[_
 
 
 class Workers(ABC):
-    """Worker objects of one class, numbered from 0.
-
-    Attributes:
-        count: Number of workers.
-        remote: Whether the workers run in parallel with this process.
-    """
+    """Worker objects of one class, numbered from 0 to `count` - 1; `remote` tells whether they run in parallel with
+    this process."""
 
     count: int
     remote = True

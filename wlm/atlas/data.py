@@ -380,8 +380,7 @@ def place_objects(
     where: str, primitives: list[GltfPrimitive], uv_set: int, objects: Sequence[Placed], masks: Sequence[np.ndarray]
 ) -> tuple[tuple[Sheet, ...], np.ndarray]:
     """Makes a model's sheets, without lightmaps, from the triangles in its file. Also returns the corners of all B
-    triangles that no sheet lights, float64 [B, 3, 3].
-    """
+    triangles that no sheet lights, float64 [B, 3, 3]."""
     by_node: dict[int, list[GltfPrimitive]] = {}
     for each in primitives:
         by_node.setdefault(each.node, []).append(each)

@@ -10,14 +10,7 @@ import numpy as np
 
 from wlm.bake.settings import BakeScene, LightmapSettings
 from wlm.errors import WlmError, one_line
-from wlm.formats.gltf import (
-    GltfDocument,
-    GltfPrimitive,
-    read_gltf,
-    reported,
-    texture_transform,
-    vertex_normals,
-)
+from wlm.formats.gltf import GltfDocument, GltfPrimitive, read_gltf, reported, texture_transform, vertex_normals
 from wlm.formats.gltf_slots import lightmap_uv, texture_picture, usual_set
 from wlm.formats.gltf_writer import Replacement
 from wlm.formats.hdr_blocks import need

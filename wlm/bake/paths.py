@@ -62,8 +62,7 @@ class Tracing:
 class Gathered:
     """Estimated incident light at N points, float32 [N, C], with the standard error of each estimate; `back`, float32
     [N], is the share of first rays that hit the back of a single-sided surface, which indicates a point inside an
-    object.
-    """
+    object."""
 
     mean: np.ndarray
     noise: np.ndarray

@@ -125,11 +125,7 @@ class LightmapSettings(_Settings):
 
 
 class ProbeSettings(_Settings):
-    """Positions of the probes, which are in a lattice in the geometry's bounding box.
-
-    Attributes:
-        spacing: Distance between neighbouring probes, in metres.
-    """
+    """Positions of the probes: a lattice in the geometry's bounding box, whose points are `spacing` metres apart."""
 
     spacing: float = Field(1.0, gt=0.0, le=1e9)
 

@@ -27,11 +27,7 @@ _Set = Annotated[
     ),
 ]
 # Columns of the scores of a sheet: heading, attribute, format, factor.
-_SCORES = (
-    ("PSNR, dB", "psnr", ".2f", 1.0),
-    ("SSIM", "ssim", ".4f", 1.0),
-    ("FLIP", "flip", ".4f", 1.0),
-)
+_SCORES = (("PSNR, dB", "psnr", ".2f", 1.0), ("SSIM", "ssim", ".4f", 1.0), ("FLIP", "flip", ".4f", 1.0))
 _SHOWN = (
     ("filtered reads, dB", "seen", ".2f", 1.0),
     ("texels beside charts, dB", "ring", ".2f", 1.0),

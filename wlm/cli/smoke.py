@@ -176,13 +176,7 @@ def bake(
 @app.command()
 @with_options
 @console.exclusive
-def predict(
-    smoke: Input,
-    output: _Lightmaps,
-    options: FrameOptions,
-    network: Network = None,
-    seed: Seed = 0,
-) -> None:
+def predict(smoke: Input, output: _Lightmaps, options: FrameOptions, network: Network = None, seed: Seed = 0) -> None:
     """Predict six-way lightmaps by a ray march in large steps: like bake, in less time.
 
     With --network a network removes the noise of a coarse march. The table names the method; the files are like those

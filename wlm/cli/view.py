@@ -21,8 +21,7 @@ def view(
     key: opt.Key = None,
     time: opt.Time = None,
     view: Annotated[
-        str | None,
-        typer.Option(help="Picture to show: light or tiles of lightmaps; balls or gaussians of probes."),
+        str | None, typer.Option(help="Picture to show: light or tiles of lightmaps; balls or gaussians of probes.")
     ] = None,
     flat: Annotated[bool, typer.Option("--flat", help="Show a lightmap as a texture, not on its mesh.")] = False,
     sliders: Annotated[

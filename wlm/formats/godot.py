@@ -66,8 +66,7 @@ _DEEPEST = 32
 class GodotUser:
     """A mesh that uses a lightmap: path of its node with "/" between names; the rectangle x, y, width, height, by whose
     last two UV2 is scaled and by whose first two it is offset, v down; index of the slice, counted through all
-    textures.
-    """
+    textures."""
 
     node: str
     rectangle: tuple[float, float, float, float]

@@ -63,8 +63,7 @@ class GridHead:
 class VdbGrid:
     """A grid of a file: its name, and values float32 [X, Y, Z] over the bounding box of the active voxels, or voxel 0
     if none is active. `low` is the box's lowest voxel (x, y, z); `matrix`, float64 [4, 4], maps indices of voxel
-    centres to world space; `background` is the value of all voxels that are not stored.
-    """
+    centres to world space; `background` is the value of all voxels that are not stored."""
 
     name: str
     matrix: np.ndarray

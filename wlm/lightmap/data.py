@@ -44,17 +44,7 @@ from wlm.lightmap.layout import odd_layout
 from wlm.lightmap.listing import Listing, list_set
 from wlm.lightmap.profile import TimeAxis
 from wlm.lightmap.reading import ALL, FROM_ALPHA, Bounds, Reader, Stack, size_text
-from wlm.lightmap.sheet import (
-    BASE,
-    LIGHT,
-    MOST_NAME,
-    VALUE_RANGES,
-    Sheet,
-    check_sheets,
-    is_group,
-    is_name,
-    sheets_of,
-)
+from wlm.lightmap.sheet import BASE, LIGHT, MOST_NAME, VALUE_RANGES, Sheet, check_sheets, is_group, is_name, sheets_of
 from wlm.texels import repair
 
 _PIECE = 1 << 18  # frames times texels that are filled at once

@@ -36,14 +36,8 @@ _GIVEN = "the times given, in the order of the names"
 
 @dataclass(frozen=True)
 class Source:
-    """A picture: a whole file, or one of several pictures of equal height that are stacked vertically in a file.
-
-    Attributes:
-        path: The file.
-        label: Name of the picture in warnings.
-        slice: Index of the picture in the stack, from the top.
-        slices: Number of pictures in the stack.
-    """
+    """A picture: the file `path`, or number `slice`, from the top, of `slices` pictures of equal height that are
+    stacked in it. `label` is its name in warnings."""
 
     path: Path
     label: str
@@ -53,14 +47,10 @@ class Source:
 
 @dataclass(frozen=True)
 class LayerInfo:
-    """A layer, which every atlas of the set has.
-
-    Attributes:
-        encoding: "radiance", "unit" for values in [0, 1], or "signed" for values in [-1, 1].
-        channels: Channels to read; None reads R, G and B of radiance and all channels of other layers.
-        stored: How the files of a layer of radiance store their light, if they don't define it themselves: an encoding
-            of `wlm.formats.channels`. None: they do.
-    """
+    """A layer, which every atlas of the set has. Its encoding is "radiance", "unit" for values in [0, 1], or "signed"
+    for values in [-1, 1]. `channels` are those to read; None reads R, G and B of radiance and all channels of other
+    layers. `stored` is the encoding of `wlm.formats.channels` in which files store radiance, None if they define it
+    themselves."""
 
     name: str
     encoding: str

@@ -27,12 +27,7 @@ from wlm.formats.scratch import room
 from wlm.formats.unity_asset import read_lighting_data
 from wlm.probe.ambient_cube import READING, read_irradiance_volume
 from wlm.probe.axes import read_axes, turned
-from wlm.probe.conventions import (
-    CANONICAL,
-    CONVENTIONS,
-    from_canonical,
-    to_canonical,
-)
+from wlm.probe.conventions import CANONICAL, CONVENTIONS, from_canonical, to_canonical
 from wlm.probe.fields import read_fields, read_positions, read_table
 from wlm.probe.hours import hour_factors, listed_times
 from wlm.probe.layouts import COEFFICIENT, ORDERS, choose_order, coefficients_first, described

@@ -36,14 +36,10 @@ _LONGEST_LINE = 1 << 20  # characters
 
 
 class Fields(NamedTuple):
-    """The fields of probes in a JSON file.
-
-    Attributes:
-        names: The names of the fields; the position and the light have the names "position" and "sh".
-        read: Reads a field as an array. Raises WlmError if it is missing or not numeric.
-        convention: The SH convention that the file states or that follows from its kind, "" if unknown.
-        axes: A remark on the axes of the positions, "" if there is none.
-    """
+    """The fields of probes in a JSON file. The position and the light have the `names` "position" and "sh". `read`
+    reads a field as an array; it raises a WlmError if the field is missing or not numeric. `convention` is the SH
+    convention that the file states or that follows from its kind, `axes` a remark on the axes of the positions; both
+    are "" if unknown."""
 
     names: list[str]
     read: Callable[[str], np.ndarray]

@@ -107,8 +107,7 @@ class Candidate:
     """The errors of all T tiles with a certain number of components: the mixtures (sets of factors that tiles share)
     and each tile's mixture, int [T]; the sizes of the components, and the squared error of each tile for each choice of
     them, float64 [choices, T], mean over the states; `left` estimates the error of the whole scene if tiles may have up
-    to this number of components.
-    """
+    to this number of components."""
 
     mixtures: Mixtures
     number: np.ndarray

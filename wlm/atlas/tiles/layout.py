@@ -78,8 +78,7 @@ def sizes_of(profile: Profile) -> list[Size]:
 def layout(error: torch.Tensor | np.ndarray, sizes: list[Size], room: float, least: float) -> Layout | None:
     """Chooses a size for each of T tiles, and places the tiles' rectangles in textures that take at most `room` bits;
     returns None if not even the smallest sizes fit. `error`, float64 [sizes, T] on any device, is the error of each
-    tile at each size; a bit is only spent where it reduces the error by at least `least`.
-    """
+    tile at each size; a bit is only spent where it reduces the error by at least `least`."""
     cost = np.array([size.bits for size in sizes], np.float64)
     sides = np.array([(size.nx, size.ny) for size in sizes])
     second = np.array([size.second for size in sizes])
@@ -182,7 +181,7 @@ class _Shelves:
 
     def place(self, width: int) -> np.ndarray:
         first, at = np.empty((len(self._order), 2), np.int64), 0
-        for (x, y), (w, h), columns, count in self._grids(width):
+        for x, y, w, h, columns, count in self._grids(width):
             row, column = np.divmod(np.arange(count), columns)
             first[self._order[at : at + count]] = np.stack([x + w * column, y + h * row], 1)
             at += count
@@ -190,18 +189,17 @@ class _Shelves:
 
     def extent(self, width: int) -> tuple[int, int]:
         """Returns the rows and columns of texels that the shelves take."""
-        grids = list(self._grids(width))
-        down = [y + h * -(-count // columns) for (_, y), (_, h), columns, count in grids]
-        return max(down, default=0), max((x + w * min(n, count) for (x, _), (w, _), n, count in grids), default=0)
+        ends = [(y + h * -(-count // n), x + w * min(n, count)) for x, y, w, h, n, count in self._grids(width)]
+        return max((row for row, _ in ends), default=0), max((column for _, column in ends), default=0)
 
-    def _grids(self, width: int) -> Iterator[tuple[tuple[int, int], tuple[int, int], int, int]]:
-        """Yields grids of equal rectangles, in order: the first one's place, their size, columns, and their number."""
+    def _grids(self, width: int) -> Iterator[tuple[int, ...]]:
+        """Yields grids of equal rectangles, in order: x and y of the first, width and height, columns, and number."""
         x = y = height = 0
         for (w, h), count in zip(self._sizes.tolist(), self._counts.tolist(), strict=True):
             # The first ones share the last shelf with the size before; the others fill shelves of their own.
             if beside := min((width - x) // w, count) if height else 0:
-                yield (x, y), (w, h), beside, beside
+                yield x, y, w, h, beside, beside
             x, rest, columns = x + w * beside, count - beside, width // w
             if rest:
-                yield (0, y + height), (w, h), columns, rest
+                yield 0, y + height, w, h, columns, rest
                 x, y, height = w * ((rest - 1) % columns + 1), y + height + h * ((rest - 1) // columns), h

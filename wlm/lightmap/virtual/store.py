@@ -44,12 +44,8 @@ _REQUESTS = 64  # most tiles that wait for the loader
 
 
 class _Pool:
-    """Device memory for tiles of one kind, in slots.
-
-    Attributes:
-        owner: int [slots], the tile in each slot, or -1.
-        arrays: The arrays of the tiles by name: parts of one memory, so that tiles are uploaded with one copy.
-    """
+    """Device memory for tiles of one kind, in slots: `owner`, int [slots], is the tile in each slot, or -1, and
+    `arrays` has the tiles' arrays by name, as parts of one memory, so that tiles are uploaded with one copy."""
 
     def __init__(self, shapes: dict[str, tuple[Any, tuple[int, ...]]], slots: int, device: str) -> None:
         """Allocates the slots; `shapes` has for each array its type, and its shape of one tile, whose first axis is
@@ -127,14 +123,7 @@ class TileStore:
     """
 
     def __init__(
-        self,
-        model: LightmapModel,
-        layout: Layout,
-        first: int,
-        device: str,
-        gelu: str,
-        room: int | None,
-        clock: Clock,
+        self, model: LightmapModel, layout: Layout, first: int, device: str, gelu: str, room: int | None, clock: Clock
     ) -> None:
         """Reads all tiles and uploads as many as fit into `room` bytes; for the errors see `VirtualTexture`.
 

@@ -14,14 +14,8 @@ ABSENT = -np.inf
 
 
 class Light(Protocol):
-    """A source of the light of N probes.
-
-    Attributes:
-        device: "cpu" or "cuda:N".
-        count: Number of probes, N.
-        channels: Numbers per probe, D.
-        time: Hour of the day of the light that `read` writes, from 0 to 24; None if it never changes.
-    """
+    """A source of the light of `count` probes of `channels` numbers each, on a device, "cpu" or "cuda:N". `time` is the
+    hour of the day of the light that `read` writes, from 0 to 24; None if it never changes."""
 
     device: str
     count: int

@@ -182,8 +182,7 @@ def _mirrored(planes: tuple[str, ...], device: str) -> torch.Tensor:
 class Plan:
     """The samples that some training steps use: indices in a pool, int [steps, B], which of a sample's two frames is
     used, 0 or 1, ignored with a temporal loss; whether it is mirrored left to right; and `corners`, int [steps, B, 2],
-    row and column of the top left pixel of the crop; None: whole images.
-    """
+    row and column of the top left pixel of the crop; None: whole images."""
 
     samples: torch.Tensor
     frames: torch.Tensor
