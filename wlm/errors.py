@@ -26,6 +26,11 @@ def one_line(text: object, limit: int = _LIMIT) -> str:
     return line if len(line) <= limit else line[: limit - 3].rstrip() + "..."
 
 
+def counted(number: int, noun: str, plural: str = "") -> str:
+    """Returns a number of things in words: "1 texel", "2 texels"; `plural` is that of nouns without a final s."""
+    return f"{number} {noun if number == 1 else plural or f'{noun}s'}"
+
+
 class WlmError(Exception):
     """An error that the user can act on: one line that names the file, the field and what was expected.
 

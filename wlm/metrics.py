@@ -23,7 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from wlm.errors import WlmError
+from wlm.errors import WlmError, counted
 from wlm.texels import fill_gaps
 
 METRICS = ("psnr", "ssim", "flip")
@@ -315,13 +315,13 @@ class LostLight:
         if self.worst is not None:
             light, kept, where = self.worst
             lines.append(
-                f"{name}: {_count(self.count, point)} among the brightest of {group} lost more than half of the light; "
-                f"the largest of {light:.4g} decodes to {kept:.4g}{where and f' ({where})'}"
+                f"{name}: {counted(self.count, point)} among the brightest of {group} lost more than half of the "
+                f"light; the largest of {light:.4g} decodes to {kept:.4g}{where and f' ({where})'}"
             )
         if self.hidden:
             lines.append(
-                f"{name}: {_count(self.hidden, point)}, most of {group}, are off by more than half of their own light; "
-                "PSNR hides it, since others are over ten times as bright"
+                f"{name}: {counted(self.hidden, point)}, most of {group}, are off by more than half of their own "
+                "light; PSNR hides it, since others are over ten times as bright"
             )
         return lines
 
@@ -332,10 +332,6 @@ def _largest(values: torch.Tensor) -> torch.Tensor:
     for channel in range(1, values.shape[1]):
         torch.maximum(result, values[:, channel].abs(), out=result)
     return result
-
-
-def _count(number: int, point: str) -> str:
-    return f"1 {point}" if number == 1 else f"{number} {point}s"
 
 
 @dataclass(frozen=True)

@@ -43,7 +43,13 @@ Name = Annotated[str, AfterValidator(_printable)]
 """A name from a file, in which spaces replace the control characters that a terminal would obey."""
 
 
-class Settings(BaseModel):
+class Checked(BaseModel):
+    """Base of classes of settings: unknown keys, NaN and infinity are errors."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
+
+
+class Settings(Checked):
     """Settings of the compression, which can be loaded by name: the base of each system's `Profile`.
 
     The docstring under a field becomes its description, from which the command line makes an option's help.
@@ -51,8 +57,6 @@ class Settings(BaseModel):
     Attributes:
         FILES: First part of the names of the profile files, `configs/FILES-NAME.yaml`.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
 
     FILES: ClassVar[str]
 
@@ -151,13 +155,13 @@ def plain(value: Any) -> Any:
     return value
 
 
-class Header(BaseModel):
+class Header(Checked):
     """Base of the classes that describe and check the settings in a model file's header.
 
     Types are strict: a text is never read as a number, nor a float as a count. NaN and infinity are refused.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+    model_config = ConfigDict(strict=True)
 
 
 class Model:

@@ -19,7 +19,7 @@ from wlm.cli.smoke_options import (
     Network,
     SmokeOptions,
     White,
-    check_white,
+    check_positive,
     note_thickness,
     outputs,
     parse_lights,
@@ -224,7 +224,7 @@ def light(
     """
     colour, around = _given_albedo(albedo), None if sky is None else vector("--sky", sky)
     behind = around if background is None else vector("--background", background)
-    check_white(white)
+    check_positive(white=white)
     own, twelve = parse_lights(lights, points, around)
     console.quiet_warp()
     from wlm.formats.exr import write_exr
@@ -304,7 +304,7 @@ def run(
     The lights and the fire of the scene illuminate the smoke with all orders of scattering. A table shows the median
     time of each stage.
     """
-    check_white(white)
+    check_positive(white=white)
     if orders == "all" and network is not None:
         raise WlmError("--network: expected --orders single, since the network makes six-way lightmaps")
     colour = _given_albedo(albedo)

@@ -34,7 +34,7 @@ from pathlib import Path
 
 import numpy as np
 
-from wlm.errors import WlmError
+from wlm.errors import WlmError, counted
 from wlm.formats.limits import TIMES
 from wlm.formats.mask import read_mask
 from wlm.formats.scratch import room
@@ -591,7 +591,7 @@ def _clamp(sheet: Sheet, labels: Sequence[str], frames: np.ndarray, mask: np.nda
         with np.errstate(invalid="ignore"):
             beyond = np.count_nonzero(((frame < 0.0) | (frame > 1.0)).any(axis=2) & inside)
         if beyond:
-            texels = f"{beyond} {'texel' if beyond == 1 else 'texels'}"
+            texels = counted(beyond, "texel")
             yield f"{labels[i]}: {sheet.label}: {texels} beyond {least:g} to {greatest:g}: clamped to it"
         np.clip(frame, 0.0, 1.0, out=frame)
 

@@ -5,7 +5,7 @@ of atlases and layers; the plain set of one lightmap for each time has one atlas
 """
 
 import re
-from collections.abc import Mapping, Sequence, Sized
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -15,7 +15,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validat
 from pydantic_core import PydanticCustomError
 
 from wlm.config import check_settings
-from wlm.errors import WlmError
+from wlm.errors import WlmError, counted
 from wlm.formats.hours import DAY, hours_of_names
 from wlm.formats.levels import SUFFIXES as LEVEL_SUFFIXES
 from wlm.formats.light import EXPECTED, SUFFIXES
@@ -192,11 +192,6 @@ def natural(name: str) -> list[str | int]:
     return [int(part) if i % 2 else part.lower() for i, part in enumerate(re.split(r"([0-9]+)", name))]
 
 
-def count_of(items: Sized, noun: str) -> str:
-    """Returns the number of items in words: "1 time", "2 times"."""
-    return f"{len(items)} {noun}{'' if len(items) == 1 else 's'}"
-
-
 def state_folders(folder: Path) -> list[Path]:
     """Returns the folders that hold lightmaps with Unity's names: the folder itself, or folders in it in natural order.
 
@@ -215,7 +210,9 @@ def state_folders(folder: Path) -> list[Path]:
 
 def _check_count(where: Path, items: Sequence[object], times: Sequence[float], noun: str) -> None:
     if len(times) != len(items):
-        raise WlmError(f"{where}: {count_of(times, 'time')} for {count_of(items, noun)}; expected a time for each")
+        raise WlmError(
+            f"{where}: {counted(len(times), 'time')} for {counted(len(items), noun)}; expected a time for each"
+        )
 
 
 def _timed(folder: Path, stems: Sequence[str], times: Sequence[float] | None, noun: str) -> dict[str, Any]:
@@ -227,8 +224,8 @@ def _timed(folder: Path, stems: Sequence[str], times: Sequence[float] | None, no
     if None in hours:
         order = ", ".join(stems[:8]) + ", ..." * (len(stems) > 8)
         raise WlmError(
-            f"{folder}: {count_of(stems, noun)} and no {SET_FILE}: give {count_of(stems, 'time')} with --times, in the "
-            f"order {order} ({stems[hours.index(None)]} does not end in an hour such as _18h)"
+            f"{folder}: {counted(len(stems), noun)} and no {SET_FILE}: give {counted(len(stems), 'time')} with "
+            f"--times, in the order {order} ({stems[hours.index(None)]} does not end in an hour such as _18h)"
         )
     a_day = len(hours) > 1 and all(0 <= hour < DAY for hour in hours)
     return {"times": hours, "period": DAY if a_day else None, "origin": "hours from the names", "doubt": doubt}

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from wlm.errors import WlmError
+from wlm.errors import WlmError, counted
 from wlm.formats.atomic import atomic_path, atomic_write
 from wlm.formats.folder import rounded
 from wlm.formats.godot import read_lmbake
@@ -499,11 +499,13 @@ def _check(where: str, name: str, raw: _Raw, convention: str | None, order: str 
     broken = np.flatnonzero(~finite)
     if len(broken):
         warnings.append(
-            f"{name}: {_probes(len(broken))} with a NaN or infinite number in {key}, first probe {broken[0]}: "
+            f"{name}: {counted(len(broken), 'probe')} with a NaN or infinite number in {key}, first probe {broken[0]}: "
             "set to zero and left out"
         )
     if repeated := _repeated(position):
-        warnings.append(f"{name}: {_probes(repeated)} at the position of another: Gaussians decode them to one value")
+        warnings.append(
+            f"{name}: {counted(repeated, 'probe')} at the position of another: Gaussians decode them to one value"
+        )
     source = _hash(position, checked, live, raw.times)
     return ProbeSet(name, position, checked, key, live, source, tuple(warnings), normal, reading, raw.times)
 
@@ -540,10 +542,6 @@ def _repeated(position: np.ndarray) -> int:
         return 0
     ordered = position[np.lexsort(position.T)]
     return int((ordered[1:] == ordered[:-1]).all(axis=1).sum())
-
-
-def _probes(count: int) -> str:
-    return f"{count} {'probe' if count == 1 else 'probes'}"
 
 
 def _hash(position: np.ndarray, values: np.ndarray, live: np.ndarray, times: np.ndarray) -> str:

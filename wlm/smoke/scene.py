@@ -17,7 +17,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PlainSerializer, ValidationInfo, model_validator
+from pydantic import AfterValidator, Field, PlainSerializer, ValidationInfo, model_validator
 from pydantic_core import PydanticCustomError
 from pydantic_core.core_schema import SerializationInfo
 from scipy.spatial.transform import Rotation
@@ -30,6 +30,7 @@ from wlm.fluid.obstacles import Mesh, Trajectory, surface
 from wlm.smoke.camera import Camera
 from wlm.smoke.meshes import SUFFIXES, Surface, read_surface
 from wlm.smoke.shading import AnyLight, Light, PointLight, Ramp
+from wlm.system import Checked
 
 _SHORTEST = 1e-12
 MOST_STEPS = 1_000_000
@@ -103,9 +104,7 @@ def _stops(glow: tuple[tuple[float, float, float, float], ...]) -> tuple[tuple[f
 _Glow = Annotated[tuple[tuple[_Number, _NotNegative, _NotNegative, _NotNegative], ...], AfterValidator(_stops)]
 
 
-class _Settings(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
+class _Settings(Checked):
     def stored(self, folder: str | os.PathLike[str]) -> dict[str, Any]:
         """Returns JSON values for a file in a folder, which names meshes relative to itself."""
         return self.model_dump(mode="json", context={"folder": folder})
