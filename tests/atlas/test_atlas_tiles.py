@@ -254,12 +254,13 @@ def test_place(seed: int):
     count = int(random.integers(1, 300))
     sizes = random.integers(1, 17, (count, 2))
     width = int(sizes[:, 0].max() + random.integers(0, 100))
-    first, height = allocation.place(sizes, width)
+    shelves = allocation.Shelves(sizes)
+    first, (height, widest) = shelves.place(width), shelves.extent(width)
     used = np.zeros((height, width), int)
     for (x, y), (w, h) in zip(first, sizes, strict=True):
         assert x >= 0 and y >= 0 and x + w <= width and y + h <= height
         used[y : y + h, x : x + w] += 1
-    assert used.max() == 1 and used[-1].any()
+    assert used.max() == 1 and used[-1].any() and used[:, widest - 1].any() and not used[:, widest:].any()
     if count > 100 and width > 64:
         assert used.mean() > 0.75
 

@@ -63,9 +63,7 @@ def _along(matrix: torch.Tensor, image: torch.Tensor) -> torch.Tensor:
 def _fit(filled: torch.Tensor, mask: torch.Tensor, start: torch.Tensor) -> torch.Tensor:
     """Refines a small image by conjugate gradients, so that bilinear reads match `filled` at the mask; [h, w, 3]."""
     both = [_bilinear(new, old) for new, old in zip(mask.shape, start.shape[:2], strict=True)]
-    rows, columns, turned_rows, turned_columns = (
-        _on(matrix, start.device) for matrix in (*both, *(each.T.tocsr() for each in both))
-    )
+    rows, columns, turned_rows, turned_columns = (_on(m, start.device) for m in (*both, *(m.T.tocsr() for m in both)))
     mask = mask.T.contiguous().T[..., None]  # in the memory order of what `read` returns
 
     def read(small: torch.Tensor) -> torch.Tensor:

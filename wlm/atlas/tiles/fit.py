@@ -108,7 +108,8 @@ def composed_model(
     """Makes the model from the tiles' solved samples, sizes and places, and numbers in the grid, int64 [T]."""
     size, mixed, code = scene.sheets[0].mask.shape, profile.colour == "mixed", first_block_code(profile.colour)
     counts = tile_counts(*size, profile.tile)
-    sides = np.array([(each.nx, each.ny) for each in sizes])[packed.chosen]
+    kinds = np.array([(each.nx, each.ny, each.step > 1, each.second) for each in sizes])[packed.chosen]
+    sides = kinds[:, :2]
     images = [(torch.zeros((*shape, 3), device=device), torch.zeros(shape, device=device)) for shape in packed.shapes]
     for members, values, weight in samples:
         each = sizes[packed.chosen[members[0]]]
@@ -129,7 +130,7 @@ def composed_model(
     place, side = np.zeros((total, 2), int), np.full((total, 2), 1 if code else BLOCK_SIDE)
     blocks = np.full(total, not code)
     place[index], side[index] = packed.first, sides
-    blocks[index] = np.array([each.step > 1 for each in sizes])[packed.chosen]
+    blocks[index] = kinds[:, 2]
     lut = pack_entries(place, side, blocks, code).reshape(*counts, 2)
     report = {
         "tiles": len(index),
@@ -138,7 +139,7 @@ def composed_model(
         "constant tiles": int((sides == 1).all(1).sum()),
     }
     if mixed:
-        report["tiles of blocks"] = int(np.array([each.second for each in sizes])[packed.chosen].sum())
+        report["tiles of blocks"] = int(kinds[:, 3].sum())
     sheets = (SheetPlace(scene.sheets[0].name, *size, 0, 0, *counts),)
     settings = (scene.name, scene.source, profile, "tiles", profile.colour, scene.states, sheets)
     return AtlasModel(*settings, **textures, lut=lut, report=report)
@@ -297,7 +298,7 @@ def curves(tiles: Tiles, sizes: list[Size], stages: Stages) -> torch.Tensor:
     table = {"error": Part(np.float64, (len(tiles.index),), least=0.0)}
     columns: dict[int, list[torch.Tensor]] = {}  # those of one number of rows, which the next sizes share
 
-    def at_size(i: int, size: Size) -> torch.Tensor:
+    def at_size(i: int, size: Size) -> dict[str, torch.Tensor]:
         if meter.due(i):
             meter.report(i)
         result, rounds = [], _ROUGH if size.step == 1 else _MEDIUM
@@ -308,15 +309,11 @@ def curves(tiles: Tiles, sizes: list[Size], stages: Stages) -> torch.Tensor:
             samples = solve(piece, size.nx, size.ny, rounds, own).clamp(min=0.0)
             weight = sample_weights(piece, size.nx, size.ny) if size.step > 1 else None
             result.append(errors(piece, colour.stored(samples, weight, size.format)))
-        return torch.cat(result)
+        return {"error": torch.cat(result)}
 
     error = torch.empty((len(sizes), len(tiles.index)), dtype=torch.float64, device=tiles.index.device)
     for i, size in enumerate(sizes):
-        if stages.checkpoint is None:
-            error[i] = at_size(i, size)  # it stays on the GPU, which waits for no copy
-        else:
-            kept = stages.batch(i, table, lambda at=(i, size): {"error": at_size(*at).cpu().numpy()})
-            error[i] = torch.from_numpy(kept["error"])
+        error[i] = torch.as_tensor(stages.batch(i, table, functools.partial(at_size, i, size))["error"])
     return error
 
 

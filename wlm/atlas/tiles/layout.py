@@ -153,7 +153,7 @@ def packed(
     if not len(size):
         return first, (step, step)
     pages = [np.arange(len(size))] if pages is None else pages
-    most, shelves = max(float(size[page].prod(1).sum()) for page in pages), [_Shelves(size[page]) for page in pages]
+    most, shelves = max(float(size[page].prod(1).sum()) for page in pages), [Shelves(size[page]) for page in pages]
     widths = [max(int(size[:, 0].max()), -(-round(share * math.sqrt(most)) // step) * step) for share in _WIDTHS]
     # No shelf may reach as far as the width allows.
     taken = [tuple(map(max, zip(*(each.extent(width) for each in shelves), strict=True))) for width in widths]
@@ -163,15 +163,9 @@ def packed(
     return first, taken[best]
 
 
-def place(sizes: np.ndarray, width: int) -> tuple[np.ndarray, int]:
-    """Packs rectangles, int [R, 2] widths and heights, on shelves (rows) `width` wide, in order of height; each shelf
-    is as high as its first rectangle. Returns x and y of each rectangle, int64 [R, 2], and the total height."""
-    shelves = _Shelves(sizes)
-    return shelves.place(width), shelves.extent(width)[0]
-
-
-class _Shelves:
-    """Rectangles, int [R, 2], sorted for `place` by falling height and then width."""
+class Shelves:
+    """Packs rectangles, int [R, 2] widths and heights, on shelves (rows), by falling height and then width. Each shelf
+    is as high as its first rectangle."""
 
     def __init__(self, sizes: np.ndarray) -> None:
         self._order = np.lexsort((-sizes[:, 0], -sizes[:, 1]))
@@ -180,6 +174,7 @@ class _Shelves:
         self._sizes, self._counts = ordered[starts], np.diff(np.append(starts, len(sizes)))
 
     def place(self, width: int) -> np.ndarray:
+        """Returns x and y of each rectangle on shelves `width` wide, int64 [R, 2]."""
         first, at = np.empty((len(self._order), 2), np.int64), 0
         for x, y, w, h, columns, count in self._grids(width):
             row, column = np.divmod(np.arange(count), columns)
