@@ -308,6 +308,13 @@ class LostLight:
             if 2 * off > int(lit.count_nonzero()):
                 self.hidden += off
 
+    def merge(self, other: "LostLight") -> None:
+        """Adds the groups of another search, as if they had been added here in their order."""
+        self.count += other.count
+        self.hidden += other.hidden
+        if other.worst is not None and (self.worst is None or other.worst[0] > self.worst[0]):
+            self.worst = other.worst
+
     def warnings(self, name: str, point: str, group: str) -> list[str]:
         """Returns one line for each kind of loss that occurred. `name` is the name of the compressed data. `point` and
         `group` are words for a point and for its group, such as "texel" and "its tile"."""

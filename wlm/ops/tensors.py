@@ -8,7 +8,7 @@ from typing import Any
 import torch
 import warp as wp
 
-from wlm.interop import to_warp, warp_stream
+from wlm.interop import launch_on, to_warp, warp_stream
 
 Shape = tuple[int | EllipsisType | None, ...]
 """Sizes of a tensor's axes; None allows any size, and a leading `...` any number of axes."""
@@ -63,7 +63,7 @@ def on_stream(device: torch.device) -> AbstractContextManager:
     wp.init()
     if device.type == "cpu":
         return nullcontext()
-    return wp.ScopedStream(warp_stream(torch.cuda.current_stream(device)), sync_enter=False)
+    return launch_on(warp_stream(torch.cuda.current_stream(device)))
 
 
 def dense(tensor: torch.Tensor) -> torch.Tensor:

@@ -36,7 +36,7 @@ from wlm.atlas.colour import quantise
 from wlm.atlas.data import LightmappedScene, Sheet
 from wlm.atlas.model import LUT_STEPS, AtlasModel, Profile, SheetPlace, snapped
 from wlm.atlas.resize import resized
-from wlm.atlas.stages import Stages, one_thread
+from wlm.atlas.stages import Stages
 from wlm.errors import WlmError
 from wlm.formats.checkpoint import Checkpoint
 from wlm.formats.exr import HALF_MAX
@@ -178,7 +178,7 @@ def tune(
     """Tunes the textures of a cascade so that the mesh looks as it does with the original lightmap. `uv`, float32 [F,
     3, 2], are the corners' UVs for the cascade. The checkpoint saves the state between steps."""
     device = interop.check_device(device)
-    with interop.stream(device), one_thread(device):
+    with interop.stream(device), interop.one_thread(device):
         step = _Step(sheet, uv, textures, profile, seed, device)
         graph = interop.StepGraph(step, device)
         meter, done = Meter(progress, "fit", profile.steps), 0

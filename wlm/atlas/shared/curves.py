@@ -21,13 +21,13 @@ import torch
 from wlm.atlas.colour import stored
 from wlm.atlas.model import BLOCK_SIDE, COLOUR_BITS, FACTOR_BITS, MOST_COARSE, extent
 from wlm.atlas.shared.mixture import Mixtures, find_mixtures, moments
-from wlm.atlas.stages import Stages, one_thread
+from wlm.atlas.stages import Stages
 from wlm.atlas.tiles.fit import Tiles, errors, sample_weights, solve, tile_light
 from wlm.atlas.tiles.layout import Size, allocate
 from wlm.dispatch import Task, Whole, gathered
 from wlm.formats.float_texels import MOST_SIDE
 from wlm.formats.parts import Part
-from wlm.interop import check_device, moved
+from wlm.interop import check_device, moved, one_thread
 from wlm.system import Meter
 
 _RANKS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)  # candidate numbers of components
