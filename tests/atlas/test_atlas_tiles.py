@@ -194,8 +194,7 @@ def test_curves_and_solved():
     # A curve is of what the file holds.
     coarse = grid.curves(tiles, [Size(4, 4, colour) for colour in ("bc6h", "rgb9e5", "half")], Stages("cpu")).numpy()
     samples = grid.solve(tiles, 4, 4, grid._MEDIUM).clamp(min=0.0)
-    weight = torch.from_numpy(np.stack([grid.sample_weights(tiles, 4, 4).numpy()])[0])
-    of_blocks = grid.errors(tiles, stored(samples, weight, "bc6h")).numpy()
+    of_blocks = grid.errors(tiles, stored(samples, grid.sample_weights(tiles, 4, 4), "bc6h")).numpy()
     np.testing.assert_allclose(coarse[0], of_blocks, rtol=1e-6)
     lit = coarse[2] > 0
     assert lit.sum() >= 7 and (coarse[0, lit] > coarse[1, lit]).all() and (coarse[1, lit] > 0.99 * coarse[2, lit]).all()

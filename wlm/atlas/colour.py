@@ -39,9 +39,7 @@ def quantise(texels: _Array, colour: str, weight: _Array | None = None, device: 
     return {name: part.cpu().numpy() for name, part in quantised(texels, colour, weight, device).items()}
 
 
-def quantised(
-    texels: _Array, colour: str, weight: _Array | None = None, device: str = "cpu"
-) -> dict[str, torch.Tensor]:
+def quantised(texels: _Array, colour: str, weight: _Array | None, device: str) -> dict[str, torch.Tensor]:
     """Encodes a linear texture such as T_p, [H, W, 3] on any device. Returns, on `device`, the arrays of `AtlasModel`:
     `texels` as decoded, half [H, W, 3], and, for a block format, `blocks`, uint8 [B, 16], row by row.
 

@@ -179,11 +179,9 @@ def with_fallback(
     format = BLOCKS if profile.colour == "mixed" else profile.colour
     block = BLOCK_SIDE if format in colour.BLOCK_CODECS else 1
     size = fitting_size(height, width, bits, (block, block), COLOUR_BITS[format])
-    if size is None:
-        if model is not None:
-            return model
-        size = 1, 1
-    textures = colour.quantised(resized(grid.light, grid.mask, *size, device=device), format, device=device)
+    if size is None and model is not None:
+        return model
+    textures = colour.quantised(resized(grid.light, grid.mask, *(size or (1, 1)), device=device), format, None, device)
     report: dict[str, Any] = {"why plain": "tiles do not fit the budget"}
     if model is not None:
         decoder, small = Decoder(model, device), textures["texels"].float()

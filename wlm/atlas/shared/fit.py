@@ -41,7 +41,8 @@ def fit_shared(scene: LightmappedScene, profile: Profile, seed: int, stages: Sta
         peak = peaks_of(scene)
         varies = variation(scene, peak, device)
         weights = scene_weights(scene, varies, profile, seed, device)
-        unit = peak * scales(varies, [_of_texels(weight) for weight in weights])
+        of_texels = [each.reshape(each.shape[0] // 2, 2, -1, 2).sum((1, 3)) for each in weights]
+        unit = peak * scales(varies, of_texels)
         planes = planes_of(scene, weights, profile.mips, device)
     kept = fitted(scene, planes, unit, varies, profile, seed, stages)
     tiles, tried, given, rows = kept.cut.tiles, kept.tried, kept.given, kept.cut.places
@@ -85,10 +86,6 @@ def fit_shared(scene: LightmappedScene, profile: Profile, seed: int, stages: Sta
         report=report,
         **textures,
     )
-
-
-def _of_texels(weight: np.ndarray) -> np.ndarray:
-    return weight.reshape(weight.shape[0] // 2, 2, -1, 2).sum((1, 3))
 
 
 def _textures(tiles: SceneTiles, tried: list[Candidate], given: Allocated) -> tuple[dict[str, np.ndarray], np.ndarray]:

@@ -129,8 +129,7 @@ def composed_model(
     total = counts[0] * counts[1]
     place, side = np.zeros((total, 2), int), np.full((total, 2), 1 if code else BLOCK_SIDE)
     blocks = np.full(total, not code)
-    place[index], side[index] = packed.first, sides
-    blocks[index] = kinds[:, 2]
+    place[index], side[index], blocks[index] = packed.first, sides, kinds[:, 2]
     lut = pack_entries(place, side, blocks, code).reshape(*counts, 2)
     report = {
         "tiles": len(index),
@@ -311,10 +310,8 @@ def curves(tiles: Tiles, sizes: list[Size], stages: Stages) -> torch.Tensor:
             result.append(errors(piece, colour.stored(samples, weight, size.format)))
         return {"error": torch.cat(result)}
 
-    error = torch.empty((len(sizes), len(tiles.index)), dtype=torch.float64, device=tiles.index.device)
-    for i, size in enumerate(sizes):
-        error[i] = torch.as_tensor(stages.batch(i, table, functools.partial(at_size, i, size))["error"])
-    return error
+    kept = (stages.batch(i, table, functools.partial(at_size, i, size))["error"] for i, size in enumerate(sizes))
+    return torch.stack([torch.as_tensor(error, device=tiles.index.device) for error in kept])
 
 
 def solved(tiles: Tiles, sizes: list[Size], chosen: np.ndarray) -> list[tuple[np.ndarray, torch.Tensor, torch.Tensor]]:

@@ -155,12 +155,11 @@ def packed(
     pages = [np.arange(len(size))] if pages is None else pages
     most, shelves = max(float(size[page].prod(1).sum()) for page in pages), [Shelves(size[page]) for page in pages]
     widths = [max(int(size[:, 0].max()), -(-round(share * math.sqrt(most)) // step) * step) for share in _WIDTHS]
-    # No shelf may reach as far as the width allows.
     taken = [tuple(map(max, zip(*(each.extent(width) for each in shelves), strict=True))) for width in widths]
-    best = min(range(len(widths)), key=lambda i: math.prod(taken[i]))
+    shape, width = min(zip(taken, widths, strict=True), key=lambda each: math.prod(each[0]))
     for each, page in zip(shelves, pages, strict=True):
-        first[page] = each.place(widths[best])
-    return first, taken[best]
+        first[page] = each.place(width)
+    return first, shape
 
 
 class Shelves:
@@ -183,7 +182,7 @@ class Shelves:
         return first
 
     def extent(self, width: int) -> tuple[int, int]:
-        """Returns the rows and columns of texels that the shelves take."""
+        """Returns the rows and columns of texels that the shelves take; none may reach as far as the width allows."""
         ends = [(y + h * -(-count // n), x + w * min(n, count)) for x, y, w, h, n, count in self._grids(width)]
         return max((row for row, _ in ends), default=0), max((column for _, column in ends), default=0)
 
