@@ -37,8 +37,7 @@ def quantise(
     texels: np.ndarray | torch.Tensor, colour: str, weight: np.ndarray | torch.Tensor | None = None, device: str = "cpu"
 ) -> dict[str, np.ndarray]:
     """Encodes the colour texture T_p, [H, W, 3] on any device. Returns the arrays `texels` and, for a block format,
-    `blocks` of `AtlasModel`. BC6H weights the squared errors of texels with `weight` [H, W].
-    """
+    `blocks` of `AtlasModel`. BC6H weights the squared errors of texels with `weight` [H, W]."""
     if colour in BLOCK_CODECS:
         blocks, decoded = encode(texels, colour, weight, device)
         return {"texels": decoded, "blocks": blocks}
@@ -51,8 +50,7 @@ def quantise(
 def stored(samples: torch.Tensor, weight: torch.Tensor | None, colour: str) -> torch.Tensor:
     """Returns the samples of T tiles after encoding and decoding, float32 [T, ny, nx, 3], at least 0; for block formats
     ny and nx are multiples of 4, and squared errors are weighted by `weight` [T, ny, nx], which other formats ignore.
-    For half floats, whose rounding is too small to matter, samples stay as they are.
-    """
+    For half floats, whose rounding is too small to matter, samples stay as they are."""
     if colour == "half":
         return samples
     if colour == "rgb9e5":

@@ -20,7 +20,7 @@ from wlm.atlas.decode import Decoder
 from wlm.atlas.model import BLOCK_SIDE, BLOCKS, COLOUR_BITS, SOURCE_BITS, AtlasModel, Profile, SheetPlace, check_area
 from wlm.atlas.resize import fitting_size, resized
 from wlm.atlas.shared.fit import fit_shared
-from wlm.atlas.stages import Stages, one_thread
+from wlm.atlas.stages import Stages
 from wlm.atlas.stored import store
 from wlm.atlas.tiles.fit import fit_tiles
 from wlm.atlas.views import Points, corner_weights
@@ -30,6 +30,7 @@ from wlm.errors import WlmError
 from wlm.formats.checkpoint import EVERY, Checkpoint
 from wlm.formats.hdr_blocks import need
 from wlm.formats.limits import check_sides
+from wlm.interop import one_thread
 from wlm.metrics import LostLight
 from wlm.ops.raster import texture
 from wlm.system import OnProgress

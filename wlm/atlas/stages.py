@@ -46,16 +46,3 @@ class Stages:
             kept = make()
             self.checkpoint.add_finished(number, kept)
         return kept
-
-
-@contextmanager
-def one_thread(device: str) -> Iterator[None]:
-    """Limits torch to one thread on the CPU. Calls of torch are so short that a second thread makes an evaluation ten
-    times slower on a busy machine and gains little on an idle one."""
-    threads = torch.get_num_threads()
-    try:
-        if device == "cpu":
-            torch.set_num_threads(1)
-        yield
-    finally:
-        torch.set_num_threads(threads)

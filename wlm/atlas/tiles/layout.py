@@ -78,8 +78,7 @@ def sizes_of(profile: Profile) -> list[Size]:
 def layout(error: torch.Tensor | np.ndarray, sizes: list[Size], room: float, least: float) -> Layout | None:
     """Chooses a size for each of T tiles, and places the tiles' rectangles in textures that take at most `room` bits;
     returns None if not even the smallest sizes fit. `error`, float64 [sizes, T] on any device, is the error of each
-    tile at each size; a bit is only spent where it reduces the error by at least `least`.
-    """
+    tile at each size; a bit is only spent where it reduces the error by at least `least`."""
     cost = np.array([size.bits for size in sizes], np.float64)
     sides = np.array([(size.nx, size.ny) for size in sizes])
     second = np.array([size.second for size in sizes])
