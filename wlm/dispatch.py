@@ -60,11 +60,11 @@ class Whole:
     finished share of the task by `report`, which has no effect in other processes.
 
     Workers whose tasks have a state have these methods themselves, but for `run`, and a method `state`, which returns a
-    list with the arrays of each batch by name. `threads` tells whether those on GPUs of this machine are threads of
-    this process, one for each GPU: their Python code must take little time, and load kernels under `interop.alone`.
+    list with the arrays of each batch by name. With an attribute `threads` that is true, those on GPUs of this machine
+    are threads of this process, one for each GPU: their Python code must take little time, and load kernels `alone`
+    (`wlm.interop`).
     """
 
-    threads = False
     report: Callable[[float], None] = staticmethod(lambda share: None)
 
     def run(self, job: Any) -> Any:
@@ -129,7 +129,7 @@ def start_workers(worker: tuple, place: Place, tasks: int) -> Workers:
     if place.cluster is not None:
         share = {"CPU": float(CPU_LANES)} if place.device == "cpu" else {"GPU": 1.0}
         return Actors(make, (place.device, *arguments), place.workers, tasks, place.cluster, share)
-    threads = make.threads and place.device != "cpu"
+    threads = getattr(make, "threads", False) and place.device != "cpu"
     if threads:
         devices = list(dict.fromkeys(devices))
     if len(devices) == 1:

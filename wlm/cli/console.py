@@ -208,6 +208,13 @@ def quiet_warp() -> None:
     _announce_compilation()
 
 
+def begin(output: Path | None, *suffixes: str) -> None:
+    """Checks the output file of a command, if it has one, see `check_output`, and starts Warp, see `quiet_warp`."""
+    if output is not None:
+        check_output(output, *suffixes)
+    quiet_warp()
+
+
 @functools.cache
 def _announce_compilation() -> None:
     from warp._src.context import Module

@@ -28,8 +28,7 @@ def fit(
     `inputs` of `open_checkpoint` too.
     Returns the input, the model, and the first facts of the result's table.
     """
-    console.check_output(output, ".wlm")
-    console.quiet_warp()
+    console.begin(output, ".wlm")
     package = import_module(f"wlm.{system}")
     checked = package.Profile.load(profile).override(settings, "--")
     data = load()

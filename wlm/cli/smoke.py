@@ -309,9 +309,7 @@ def run(
         raise WlmError("--network: expected --orders single, since the network makes six-way lightmaps")
     colour = _given_albedo(albedo)
     film_file = output.suffix.lower() == ".mp4"
-    if film_file:
-        console.check_output(output, ".mp4")
-    console.quiet_warp()
+    console.begin(output if film_file else None, ".mp4")
     from wlm.formats.film import film
     from wlm.interop import check_device
     from wlm.smoke.data import NumberedFiles

@@ -8,7 +8,7 @@ import typer
 from rich.markup import escape
 
 from wlm.cli import options as opt
-from wlm.cli.console import check_output, quiet_warp, show, table
+from wlm.cli.console import begin, show, table
 from wlm.errors import WlmError
 
 _SLIDERS = ("hour", "sigma", "exposure", "error")
@@ -47,9 +47,7 @@ def view(
     """Show compressed lightmaps or probes in a window; with --original, beside the original and the error."""
     pixels = _size(size)
     values = _values(sliders or ())
-    if screenshot is not None:
-        check_output(screenshot, ".png")
-    quiet_warp()
+    begin(screenshot, ".png")
     from wlm.formats.hdr_blocks import need
     from wlm.view.opening import open_scene
     from wlm.view.window import Window

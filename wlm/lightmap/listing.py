@@ -20,7 +20,7 @@ from wlm.formats.hours import DAY, hours_of_names
 from wlm.formats.levels import SUFFIXES as LEVEL_SUFFIXES
 from wlm.formats.light import EXPECTED, SUFFIXES
 from wlm.formats.limits import TIMES
-from wlm.formats.reading import named_file, read_json_file
+from wlm.formats.reading import named_file, read_json_file, system_errors
 from wlm.lightmap.sheet import BASE, LIGHT, MOST_CHANNELS, MOST_NAME, MOST_SHEETS, is_group, is_name
 
 SET_FILE = "set.json"
@@ -197,15 +197,13 @@ def state_folders(folder: Path) -> list[Path]:
 
     A folder with lightmaps of other names is a plain set, whatever the folders in it contain.
     """
-    try:
+    with system_errors(f"{folder}: cannot read"):
         if _has_light(folder):
             return [folder]
         inside = sorted(folder.iterdir(), key=lambda path: natural(path.name))
         if any(path.suffix.lower() in SUFFIXES and path.is_file() for path in inside):
             return []
         return [path for path in inside if path.is_dir() and _has_light(path)]
-    except OSError as error:
-        raise WlmError(f"{folder}: cannot read: {error.strerror or error}") from error
 
 
 def _check_count(where: Path, items: Sequence[object], times: Sequence[float], noun: str) -> None:
@@ -233,10 +231,8 @@ def _timed(folder: Path, stems: Sequence[str], times: Sequence[float] | None, no
 
 def _list_folder(folder: Path, times: Sequence[float] | None, levels: bool) -> Listing:
     suffixes = SUFFIXES + LEVEL_SUFFIXES * levels
-    try:
+    with system_errors(f"{folder}: cannot read"):
         files = [f for f in folder.iterdir() if f.suffix.lower() in suffixes and f.is_file() and f.name != "mask.png"]
-    except OSError as error:
-        raise WlmError(f"{folder}: cannot read: {error.strerror or error}") from error
     # Hidden files belong to other programs: macOS writes one beside every file on a foreign disk.
     files = sorted((f for f in files if f.name[0] != "."), key=lambda f: (natural(f.name), f.name))
     if not files:
