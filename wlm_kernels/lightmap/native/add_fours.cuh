@@ -3,10 +3,11 @@
 #if defined(__CUDA_ARCH__)
     constexpr int WIDE = 20;  // numbers in a row, as in `matrix_step.cuh`
     const int own = threadIdx.x & 31;
+    const int then = first < 0 ? -1 : second;
     float* mine = static_cast<float*>(__cvta_shared_to_generic(row));
     // Steps of 2^-40.
     reinterpret_cast<float4*>(mine)[0] =
-        make_float4(__int_as_float(first), a * 1099511627776.0f, __int_as_float(second), b * 1099511627776.0f);
+        make_float4(__int_as_float(first), a * 1099511627776.0f, __int_as_float(then), b * 1099511627776.0f);
     reinterpret_cast<float4*>(mine)[1] = make_float4(g.c[0], g.c[1], g.c[2], g.c[3]);
     const unsigned any = __ballot_sync(0xffffffffu, first >= 0);
     __syncwarp();
