@@ -12,7 +12,7 @@ from typing import Any
 import warp as wp
 
 from wlm_kernels.interpolate import axis_index, cell, fraction
-from wlm_kernels.lightmap.features import Cell, Maps, corner_weights, four_at, uv_place, uvt_place
+from wlm_kernels.lightmap.features import Cell, Maps, corner_weights, corners_at, four_at, uv_place
 from wlm_kernels.native import native_source
 
 
@@ -89,33 +89,24 @@ def scatters(device_kind: str) -> tuple[Any, Any, Any, Any]:
     @wp.func
     def scatter_volume(acc: wp.array2d[scalar], lane: int, maps: Maps, n: int, cell: Cell, g: wp.vec4):
         # The four corners of a slice lie in one to four blocks: endpoints get one sum per block, not per corner.
-        in_x = wp.where(cell.x[0] >> 2 == cell.x[1] >> 2, 1.0, 0.0)
-        in_y = wp.where(cell.y[0] >> 2 == cell.y[1] >> 2, 1.0, 0.0)
+        in_x = wp.where(cell.in_x, 1.0, 0.0)
+        in_y = wp.where(cell.in_y, 1.0, 0.0)
         two = int(2)  # rolled, as in volume_at
         for k in range(two):
             s = n * maps.slices + wp.where(k == 0, cell.t[0], cell.t[1])
+            corners = corners_at(maps, s, cell)
             weights = corner_weights(cell, k)
-            first = wp.vec4()
-            second = wp.vec4()
-            at = wp.vec4i()
             on_weights = wp.vec4()
-            weight_at = wp.vec4i()
             for q in range(4):
-                place = uvt_place(maps, s, cell.y[q // 2], cell.x[q % 2])
-                w = maps.values[place.weight]
-                along = four_at(maps.values, place.endpoints + 4) - four_at(maps.values, place.endpoints)
-                on_weights[q] = weights[q] * wp.dot(along, g)
-                weight_at[q] = place.weight
-                first[q] = weights[q] * (1.0 - w)
-                second[q] = weights[q] * w
-                at[q] = place.endpoints
-            add_corners(acc, lane, weight_at, on_weights)
-            first = _joined(first, in_x, in_y)
-            second = _joined(second, in_x, in_y)
-            if in_x != 0.0:
+                on_weights[q] = weights[q] * wp.dot(corners.high[q] - corners.low[q], g)
+            add_corners(acc, lane, corners.weights, on_weights)
+            first = _joined(wp.cw_mul(weights, wp.vec4(1.0) - corners.w), in_x, in_y)
+            second = _joined(wp.cw_mul(weights, corners.w), in_x, in_y)
+            at = corners.endpoints
+            if cell.in_x:
                 at[1] = -1
                 at[3] = -1
-            if in_y != 0.0:
+            if cell.in_y:
                 at[2] = -1
                 at[3] = -1
             for q in range(4):

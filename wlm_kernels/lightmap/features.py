@@ -40,26 +40,24 @@ class Maps:
     columns: int
 
 
-@wp.func_native(native_source(__package__, "two_at"))
-def two_at(values: wp.array1d[float], i: int) -> wp.vec2: ...
+@wp.func_native(native_source(__package__, "cells_at"))
+def cells_at(values: wp.array1d[float], i: int, j: int) -> wp.vec4: ...
 
 
-@wp.func_native(native_source(__package__, "four_at", ONCE=0))
+@wp.func_native(native_source(__package__, "four_at"))
 def four_at(values: wp.array1d[float], i: int) -> wp.vec4: ...
+
+
+@wp.func_native(native_source(__package__, "pair_at"))
+def pair_at(values: wp.array1d[float], i: int, j: int) -> wp.vec2: ...
 
 
 @wp.struct
 class Place:
-    """Where numbers of a texel of a map of blocks are: index of its block's endpoints, 8 numbers, and of its weight."""
+    """Where numbers of a texel of F_uv are: index of its block's endpoints, 8 numbers, and of its weight."""
 
     endpoints: int
     weight: int
-
-
-@wp.func
-def texel_at(values: wp.array1d[float], place: Place, quantised: int) -> wp.vec4:
-    e0 = four_at(values, place.endpoints)
-    return ste_mix(e0, four_at(values, place.endpoints + 4), values[place.weight], quantised)
 
 
 @wp.func
@@ -77,6 +75,8 @@ class Cell:
     x: wp.vec2i
     y: wp.vec2i
     t: wp.vec2i
+    in_x: bool  # whether both along x lie in one block
+    in_y: bool
     fx: float
     fy: float
     ft: float
@@ -91,19 +91,65 @@ def cell_of(maps: Maps, u: float, v: float, tau: float, periodic: int) -> Cell:
     c.x = wp.vec2i(axis_index(x, maps.side, 0), axis_index(x + 1, maps.side, 0))
     c.y = wp.vec2i(axis_index(y, maps.side, 0), axis_index(y + 1, maps.side, 0))
     c.t = wp.vec2i(axis_index(t, maps.slices, periodic), axis_index(t + 1, maps.slices, periodic))
+    c.in_x = c.x[0] >> 2 == c.x[1] >> 2
+    c.in_y = c.y[0] >> 2 == c.y[1] >> 2
     c.fx = fraction(u, maps.side)
     c.fy = fraction(v, maps.side)
     c.ft = fraction(tau, maps.slices)
     return c
 
 
+@wp.struct
+class Corners:
+    """The four texels of a slice of F_uvt around a sample, along x first: where their blocks' endpoints and their
+    weights are, and these."""
+
+    endpoints: wp.vec4i
+    weights: wp.vec4i
+    w: wp.vec4
+    low: wp.mat44
+    high: wp.mat44
+
+
 @wp.func
-def uvt_place(maps: Maps, s: int, y: int, x: int) -> Place:
+def corners_at(maps: Maps, s: int, cell: Cell) -> Corners:
     side = maps.side
-    place = Place()
-    place.endpoints = maps.uvt_endpoints + 8 * ((s * (side >> 2) + (y >> 2)) * (side >> 2) + (x >> 2))
-    place.weight = maps.uvt_weights + (s * side + y) * side + x
-    return place
+    endpoints = wp.vec4i()
+    weights = wp.vec4i()
+    for q in range(4):
+        y = s * side + cell.y[q // 2]
+        x = cell.x[q % 2]
+        endpoints[q] = maps.uvt_endpoints + 8 * ((y >> 2) * (side >> 2) + (x >> 2))
+        weights[q] = maps.uvt_weights + y * side + x
+    early = pair_at(maps.values, weights[0], weights[1])
+    late = pair_at(maps.values, weights[2], weights[3])
+    # Most corners have one block, which is read once: a GPU takes longer for each place that a load reads.
+    low0 = four_at(maps.values, endpoints[0])
+    high0 = four_at(maps.values, endpoints[0] + 4)
+    low1 = low0
+    high1 = high0
+    if not cell.in_x:
+        low1 = four_at(maps.values, endpoints[1])
+        high1 = four_at(maps.values, endpoints[1] + 4)
+    low2 = low0
+    high2 = high0
+    low3 = low1
+    high3 = high1
+    if not cell.in_y:
+        low2 = four_at(maps.values, endpoints[2])
+        high2 = four_at(maps.values, endpoints[2] + 4)
+        low3 = low2
+        high3 = high2
+        if not cell.in_x:
+            low3 = four_at(maps.values, endpoints[3])
+            high3 = four_at(maps.values, endpoints[3] + 4)
+    c = Corners()
+    c.endpoints = endpoints
+    c.weights = weights
+    c.w = wp.vec4(early[0], early[1], late[0], late[1])
+    c.low = wp.matrix_from_rows(low0, low1, low2, low3)
+    c.high = wp.matrix_from_rows(high0, high1, high2, high3)
+    return c
 
 
 @wp.func
@@ -121,10 +167,10 @@ def volume_at(maps: Maps, n: int, cell: Cell, quantised: int) -> wp.vec4:
     two = int(2)  # a variable keeps the loop rolled: unrolled, the code outgrows the GPU's instruction cache
     for k in range(two):
         s = n * maps.slices + wp.where(k == 0, cell.t[0], cell.t[1])
+        corners = corners_at(maps, s, cell)
         weights = corner_weights(cell, k)
         for q in range(4):
-            place = uvt_place(maps, s, cell.y[q // 2], cell.x[q % 2])
-            f += weights[q] * texel_at(maps.values, place, quantised)
+            f += weights[q] * ste_mix(corners.low[q], corners.high[q], corners.w[q], quantised)
     return f
 
 
@@ -138,8 +184,10 @@ def plane_at(maps: Maps, offset: int, n: int, p: float, tau: float, periodic: in
     xb = offset + 2 * axis_index(x + 1, maps.columns, 0)
     ta = 2 * maps.columns * (n * maps.rows + axis_index(t, maps.rows, periodic))
     tb = 2 * maps.columns * (n * maps.rows + axis_index(t + 1, maps.rows, periodic))
-    early = (1.0 - fx) * two_at(maps.values, ta + xa) + fx * two_at(maps.values, ta + xb)
-    late = (1.0 - fx) * two_at(maps.values, tb + xa) + fx * two_at(maps.values, tb + xb)
+    a = cells_at(maps.values, ta + xa, ta + xb)
+    b = cells_at(maps.values, tb + xa, tb + xb)
+    early = (1.0 - fx) * wp.vec2(a[0], a[1]) + fx * wp.vec2(a[2], a[3])
+    late = (1.0 - fx) * wp.vec2(b[0], b[1]) + fx * wp.vec2(b[2], b[3])
     return (1.0 - ft) * early + ft * late
 
 

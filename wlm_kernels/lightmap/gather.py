@@ -26,16 +26,8 @@ def _drain(sums: wp.array2d[float], i: int, clear: int) -> float:
     return s
 
 
-@wp.func_native(native_source(__package__, "put_four", ONCE=0))
+@wp.func_native(native_source(__package__, "put_four"))
 def _put_four(values: wp.array1d[float], i: int, v: wp.vec4): ...
-
-
-@wp.func_native(native_source(__package__, "four_at", ONCE=1))
-def _moments_at(values: wp.array1d[float], i: int) -> wp.vec4: ...
-
-
-@wp.func_native(native_source(__package__, "put_four", ONCE=1))
-def _put_moments(values: wp.array1d[float], i: int, v: wp.vec4): ...
 
 
 @wp.func_native(native_source(__package__, "take_four"))
@@ -148,8 +140,8 @@ def _update(
     # All reads come before the first write, for which they would wait.
     at = 4 * t
     value = four_at(maps.values, at)
-    first = _moments_at(adam.first, at)
-    second = _moments_at(adam.second, at)
+    first = four_at(adam.first, at)
+    second = four_at(adam.second, at)
     grad = _drain_four(acc, t)
     for c in range(4):
         new = _moved(wp.vec3(value[c], first[c], second[c]), grad[c], adam.decay, adam.epsilon, now[0], corrections)
@@ -157,8 +149,8 @@ def _update(
         first[c] = new[1]
         second[c] = new[2]
     _put_four(maps.values, at, value)
-    _put_moments(adam.first, at, first)
-    _put_moments(adam.second, at, second)
+    _put_four(adam.first, at, first)
+    _put_four(adam.second, at, second)
     if levels != 0:
         _put_four(rounded, at, _level(maps, at, value))
 

@@ -20,6 +20,7 @@ import warp as wp
 
 from wlm_kernels import mlp
 from wlm_kernels.lightmap.adjoint import scatters
+from wlm_kernels.lightmap.blocks import ste_mix
 from wlm_kernels.lightmap.features import (
     CENTRE,
     INPUTS,
@@ -29,8 +30,8 @@ from wlm_kernels.lightmap.features import (
     Sample,
     cell_of,
     draw_sample,
+    four_at,
     plane_at,
-    texel_at,
     texel_weight,
     track_error,
     uv_place,
@@ -129,8 +130,12 @@ def step_kernels(hidden: int, gelu: str, device_kind: str) -> StepKernels:
         f = vec_in()
         u, v = place_of(sample)
         tau = batch.tau[sample.k]
-        uv = texel_at(maps.values, uv_place(maps, n, sample.flat), quantised)
+        place = uv_place(maps, n, sample.flat)
+        low = four_at(maps.values, place.endpoints)
+        high = four_at(maps.values, place.endpoints + 4)
+        w = maps.values[place.weight]
         uvt = volume_at(maps, n, cell_of(maps, u, v, tau, batch.periodic), quantised)
+        uv = ste_mix(low, high, w, quantised)  # late, so that its reads need no waiting
         ut = plane_at(maps, maps.ut, n, u, tau, batch.periodic)
         vt = plane_at(maps, maps.vt, n, v, tau, batch.periodic)
         e = batch.encoding[sample.k]
