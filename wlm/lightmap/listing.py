@@ -125,9 +125,10 @@ def list_set(
     for name, own in (groups or {}).items():
         if not is_group(name) or name in found:
             raise WlmError(f"{own}: expected a group's name that is printable, without '=' and not taken, got {name!r}")
-        listings = (
-            [_alone(own)] if _is_lightmap(own) else [*_listings(own, None, layers, trust, stored is not None).values()]
-        )
+        if _is_lightmap(own):  # one lightmap, which is the same at all times
+            listings = [_of_files(own.stem, own, [own], None, times=[0.0], period=None)]
+        else:
+            listings = list(_listings(own, None, layers, trust, stored is not None).values())
         if len(listings) > 1:
             raise WlmError(f"{own}: group {name}: expected a set without groups, found one with {len(listings)}")
         found[name] = listings[0]
@@ -153,18 +154,12 @@ def _is_lightmap(path: Path) -> bool:
     return path.is_file() and path.suffix.lower() in SUFFIXES + LEVEL_SUFFIXES
 
 
-def _alone(file: Path) -> Listing:
-    """Lists one lightmap, which is the same at all times."""
-    return Listing(
-        name=file.stem,
-        where=file,
-        times=[0.0],
-        period=None,
-        layers=(LayerInfo(LIGHT.layer, LIGHT.encoding),),
-        atlases=(AtlasInfo(LIGHT.atlas, None),),
-        states=[{(LIGHT.atlas, LIGHT.layer): Source(file, file.name)}],
-        labels=[file.name],
-    )
+def _of_files(name: str, where: Path, files: Sequence[Path], mask: str | None, **timed: Any) -> Listing:
+    """Lists files of light as the only atlas; `timed` has the fields of a `Listing` about times."""
+    layers, atlases = (LayerInfo(LIGHT.layer, LIGHT.encoding),), (AtlasInfo(LIGHT.atlas, mask),)
+    states = [{(LIGHT.atlas, LIGHT.layer): Source(file, file.name)} for file in files]
+    labels = [file.name for file in files]
+    return Listing(name, where, layers=layers, atlases=atlases, states=states, labels=labels, **timed)
 
 
 def _listings(
@@ -237,16 +232,8 @@ def _list_folder(folder: Path, times: Sequence[float] | None, levels: bool) -> L
     files = sorted((f for f in files if f.name[0] != "."), key=lambda f: (natural(f.name), f.name))
     if not files:
         raise WlmError(f"{folder}: expected a {SET_FILE} or lightmaps ({', '.join(SUFFIXES)}), found none of them")
-    mask = folder / "mask.png"
-    return Listing(
-        name=folder.resolve().name,
-        where=folder,
-        layers=(LayerInfo(LIGHT.layer, LIGHT.encoding),),
-        atlases=(AtlasInfo(LIGHT.atlas, str(mask) if mask.is_file() else "all"),),
-        states=[{(LIGHT.atlas, LIGHT.layer): Source(file, file.name)} for file in files],
-        labels=[file.name for file in files],
-        **_timed(folder, [f.stem for f in files], times, "lightmap"),
-    )
+    mask, timed = folder / "mask.png", _timed(folder, [f.stem for f in files], times, "lightmap")
+    return _of_files(folder.resolve().name, folder, files, str(mask) if mask.is_file() else "all", **timed)
 
 
 def _has_light(folder: Path) -> bool:
