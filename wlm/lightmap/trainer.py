@@ -441,7 +441,7 @@ class Trainer:
         with interop.stream(self.device):
             for key in _STATE:
                 getattr(self, key).copy_(values[key])
-            self.maps.clamp_(0.0, 1.0)  # for states of version 0.1
+            self.maps.clamp_(0.0, 1.0)  # as steps do; maps of version 0.2 may lie outside
             for key, moments in self._moments.items():
                 moments.copy_(values[key])
 

@@ -123,7 +123,7 @@ def corners_at(maps: Maps, s: int, cell: Cell) -> Corners:
         weights[q] = maps.uvt_weights + y * side + x
     early = pair_at(maps.values, weights[0], weights[1])
     late = pair_at(maps.values, weights[2], weights[3])
-    # Most corners have one block, which is read once: a GPU takes longer for each place that a load reads.
+    # Most samples have one block, which is read once: a GPU's cache looks up one line of a load after another.
     low0 = four_at(maps.values, endpoints[0])
     high0 = four_at(maps.values, endpoints[0] + 4)
     low1 = low0
