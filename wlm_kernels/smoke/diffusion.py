@@ -25,13 +25,18 @@ from wlm_kernels.smoke.march import (
     between_nodes,
     box_of,
     for_smoke,
+    has_smoke,
+    in_tiles,
     look,
     parameters,
     pass_step,
+    pixel_of,
     sample,
     steps_along,
+    voxel,
     way_to_solid,
 )
+from wlm_kernels.smoke.naf_block import lane_sum
 from wlm_kernels.smoke.settings import March
 
 wp.set_module_options(OPTIONS)
@@ -43,6 +48,7 @@ _FIRST = 3  # rounds on the coarsest grid
 _RAYS = 4096  # rays from a point light
 _LEAST = 1e-5  # share of a ray's light below which it ends
 _TURN = wp.constant(2.399963229728653)  # the golden angle
+_FLUENCES = wp.constant(4)  # fluences that share a ray
 _PARTS = 4  # largest number of samples of a cell along an axis for direct light
 
 
@@ -143,6 +149,56 @@ def _relax(
         got += flows[n, i, j, k - 1][2] * light[n, i, j, k - 1]
     now = light[n, i, j, k]
     light[n, i, j, k] = wp.max(now + over * (got * own[3] - now), 0.0)
+
+
+@wp.func
+def _covered(low: float, high: float, i: int) -> float:
+    return wp.max(wp.min(high, float(i) + 1.0) - wp.max(low, float(i)), 0.0)
+
+
+@for_smoke
+def _mean(smoke_type: Any, rows: int, length: int) -> wp.Kernel:
+    field_type = smoke_type.vars["density"].type
+
+    @wp.kernel(module="unique", module_options=OPTIONS)
+    def kernel(
+        # in:
+        smoke: smoke_type,
+        field: field_type,
+        cell: wp.vec3,
+        # out:
+        out: wp.array3d[float],
+    ):
+        i, j, k, lane = wp.tid()
+        low = wp.cw_mul(wp.vec3(float(i), float(j), float(k)), cell)
+        high = low + cell
+        y0 = int(low[1]) + lane // wp.static(length)
+        z0 = int(low[2]) + lane % wp.static(length)
+        x1 = wp.min(int(wp.ceil(high[0])), smoke.cells[0])
+        y1 = wp.min(int(wp.ceil(high[1])), smoke.cells[1])
+        z1 = wp.min(int(wp.ceil(high[2])), smoke.cells[2])
+        total = float(0.0)
+        for x in range(int(low[0]), x1):
+            plane = float(0.0)
+            for y in range(y0, y1, wp.static(rows)):
+                row = float(0.0)
+                for z in range(z0, z1, wp.static(length)):
+                    if has_smoke(smoke.bricks, wp.vec3(float(x), float(y), float(z))):
+                        row += _covered(low[2], high[2], z) * voxel(field, smoke.cells, smoke.places, x, y, z)
+                plane += _covered(low[1], high[1], y) * row
+            total += _covered(low[0], high[0], x) * plane
+        total = lane_sum(total, wp.static(rows * length))
+        if lane == 0:
+            out[i, j, k] = total / (cell[0] * cell[1] * cell[2])
+
+    return kernel
+
+
+def mean(medium: Medium, field: wp.array, cell: wp.vec3, out: wp.array) -> None:
+    """Computes the mean of the smoke's density or temperature, `field`, over each cell of a coarse grid, `out`, float
+    [X, Y, Z], whose cells have the edges `cell` in voxels. Bricks that `medium` knows as empty count as 0."""
+    rows, length = (4, 8) if medium.device.is_cuda else (1, 1)
+    _mean(medium, (*out.shape, rows * length), [field, cell], [out], rows, length)
 
 
 @wp.func
@@ -364,24 +420,33 @@ def _gather(smoke_type: Any) -> wp.Kernel:
         out: wp.array4d[float],
         thin: wp.array2d[float],
     ):
-        n, row, column = wp.tid()
+        several, a, b, lane = wp.tid()
+        row, column = pixel_of(a, b, lane)
+        if row >= view.height or column >= view.width:
+            return
+        first = several * _FLUENCES
         r = begin(view, row, column, smoke, march.step, 0.5)
-        total = float(0.0)
-        from_thin = float(0.0)
+        total = wp.vec4()
+        from_thin = wp.vec4()
         opacity = float(0.0)
         while r.done < r.count:
             r = look(r, smoke)
             if r.x > 0.0:
-                here = between_nodes(light[n], wp.cw_div(r.place, cell) - wp.vec3(0.5, 0.5, 0.5))
+                q = wp.cw_div(r.place, cell) - wp.vec3(0.5, 0.5, 0.5)
                 share = r.t * absorbed(r.x)
                 clear = share * wp.exp(-r.sigma * wp.min(cell))
-                total += share * here
-                from_thin += clear * here
+                for n in range(_FLUENCES):
+                    if first + n < light.shape[0]:
+                        here = between_nodes(light[first + n], q)
+                        total[n] += share * here
+                        from_thin[n] += clear * here
                 opacity += clear
             r = pass_step(r, march.cutoff)
-        out[0, n, row, column] = total / (4.0 * wp.pi)
-        out[1, n, row, column] = from_thin / (4.0 * wp.pi)
-        if n == 0:
+        for n in range(_FLUENCES):
+            if first + n < light.shape[0]:
+                out[0, first + n, row, column] = total[n] / (4.0 * wp.pi)
+                out[1, first + n, row, column] = from_thin[n] / (4.0 * wp.pi)
+        if several == 0:
             thin[row, column] = opacity
 
     return kernel
@@ -426,4 +491,5 @@ def gather(
             transparency that a cell of its density has.
         thin: float [H, W], written: the opacity of thin smoke, weighted in the same way.
     """
-    _gather(medium, out.shape[1:], [view, parameters(march), cell, light], [out, thin])
+    size = (-(-light.shape[0] // int(_FLUENCES)), *in_tiles(*thin.shape))
+    _gather(medium, size, [view, parameters(march), cell, light], [out, thin])
