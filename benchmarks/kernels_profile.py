@@ -24,7 +24,7 @@ from benchmarks.runner import Bench, Note, check_only
 from wlm.errors import WlmError
 
 KERNELS = 3  # rows of a case
-_LAUNCHES = 250  # most launches of a case that are profiled
+_LAUNCHES = 60  # most launches of a case that are profiled
 _SECONDS = 60.0  # most time of a case
 _TIME = "gpu__time_duration.sum"
 _STALLS = {

@@ -4,6 +4,7 @@
 compares it with the result files.
 """
 
+import functools
 import hashlib
 import json
 import re
@@ -45,12 +46,17 @@ class Curve:
         Raises:
             WlmError: There is no such row, or the file can't be read.
         """
-        runs = [run for run in read_runs(RESULTS / f"{self.file}.json") if "--quick" not in str(run.environment)]
-        rows = [row for run in runs for row in run.rows if (row.system, row.scene) == (self.system, self.scene)]
+        rows = [row for row in _rows(self.file) if (row.system, row.scene) == (self.system, self.scene)]
         rows = [row for row in rows if re.fullmatch(self.pattern, f"{row.method} {row.option}".strip())]
         if not rows:
             raise WlmError(f"{self.file}.json: expected rows of {self.scene} that match {self.pattern}, found none")
         return rows
+
+
+@functools.cache
+def _rows(file: str) -> list[Row]:
+    runs = read_runs(RESULTS / f"{file}.json")
+    return [row for run in runs if "--quick" not in str(run.environment) for row in run.rows]
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ import warp as wp
 from wlm.cli.console import quiet_warp
 from wlm.errors import WlmError
 from wlm.formats.exr import write_exr
-from wlm.formats.gltf import document_from_arrays
+from wlm.formats.gltf import document_from_meshes
 from wlm.formats.gltf_writer import write_glb
 from wlm.texels import fill_gaps
 
@@ -326,7 +326,7 @@ def main() -> None:
     position, triangle, uv, lightmap = bake(charts, placed(charts))
     try:
         args.out.mkdir(parents=True, exist_ok=True)
-        document, _ = document_from_arrays(position, triangle, uv, NAME)
+        document, _ = document_from_meshes([(NAME, position, triangle, uv)], NAME)
         size = write_glb(args.out / f"{NAME}.glb", document, [], 1)
         write_exr(args.out / f"{NAME}.exr", lightmap)
     except (WlmError, OSError) as error:

@@ -100,10 +100,10 @@ def kills_one(monkeypatch, kind, kill):
     return killed
 
 
-SLOW = tuple(pytest.param(job, marks=pytest.mark.slow) for job in JOBS[:4])
+SLOW = tuple(pytest.param(job, marks=pytest.mark.slow) for job in JOBS if job is not hours)
 
 
-@pytest.mark.parametrize("job", [*SLOW, hours, frames])
+@pytest.mark.parametrize("job", [*SLOW, hours])
 def test_a_killed_process_changes_nothing(job, tmp_path, monkeypatch):
     whole = job(tmp_path, monkeypatch)
     killed = kills_one(monkeypatch, workers.Processes, lambda pool, number: pool._processes[number].kill())

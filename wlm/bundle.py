@@ -37,22 +37,7 @@ INDEX_FILE = "bundle.json"
 FORMAT = "wlm-bundle"
 """`format` of these indexes."""
 
-RESERVED = frozenset(
-    (
-        "format",
-        "version",
-        "system",
-        "name",
-        "engine",
-        "shader",
-        "compute",
-        "textures",
-        "buffers",
-        "reference",
-        "files",
-        "parts",
-    )
-)
+RESERVED = frozenset("format version system name engine shader compute textures buffers reference files parts".split())
 """Keys of an exported index that `wlm.export` fills in; a document must not have them."""
 
 _MARK = re.compile(r"@(\w+)@")
@@ -149,11 +134,8 @@ class Bundle:
 
 
 def filled(package: str, name: str, /, **parts: object) -> str:
-    """Reads a text from the folder `assets` of a package and replaces its marks `@NAME@` by `parts`.
-
-    Raises:
-        KeyError: A mark is not among `parts`.
-    """
+    """Reads a text from the folder `assets` of a package and replaces its marks `@NAME@` by `parts`. Raises a KeyError
+    if a mark is not among `parts`."""
     text = (resources.files(package) / "assets" / name).read_text(encoding="utf-8")
     return _MARK.sub(lambda match: str(parts[match[1]]), text)
 

@@ -21,6 +21,7 @@ _Settings = TypeVar("_Settings", bound=BaseModel)
 _SHOWN_VALUE = 60  # characters of a wrong value that an error message repeats
 _DEEPEST = 50
 _MERGE = "tag:yaml.org,2002:merge"
+_NOT_YAML = (yaml.YAMLError, ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RecursionError)
 _INTEGER_LENGTH = 80  # characters: 64 binary digits with signs between them
 
 
@@ -37,15 +38,7 @@ def read_yaml(path: str | os.PathLike[str]) -> dict[Any, Any]:
         raise WlmError(f"{path}: expected YAML in UTF-8, found an invalid byte at position {error.start}") from error
     try:
         values = yaml.load(text, _Loader)
-    except (
-        yaml.YAMLError,
-        ValueError,
-        TypeError,
-        LookupError,
-        AttributeError,
-        ArithmeticError,
-        RecursionError,
-    ) as error:
+    except _NOT_YAML as error:
         raise WlmError(f"{path}: expected YAML: {_yaml_problem(error)}") from error
     if values is None:
         raise WlmError(f"{path}: expected a mapping of settings, found an empty file")

@@ -1,4 +1,4 @@
-"""Hands out the independent tasks of long work to workers: in this process, in other processes, or on a Ray cluster.
+"""Hands out the independent tasks of long work to workers: in this process, its threads, other processes, or a cluster.
 
 The result of a task does not depend on the worker, so the work has the same result for any number of workers, in any
 order of completion, and if workers are lost.
@@ -19,7 +19,7 @@ from wlm.errors import WlmError, one_line
 from wlm.formats.checkpoint import Checkpoint
 from wlm.formats.parts import Part
 from wlm.system import Meter
-from wlm.workers import Actors, Here, Lost, Processes, Workers
+from wlm.workers import Actors, Here, Lost, Processes, Threads, Workers
 
 CPU_LANES = 2
 """Number of CPU threads that a task may keep busy: a worker on a cluster's CPUs takes as many."""
@@ -60,7 +60,9 @@ class Whole:
     finished share of the task by `report`, which has no effect in other processes.
 
     Workers whose tasks have a state have these methods themselves, but for `run`, and a method `state`, which returns a
-    list with the arrays of each batch by name.
+    list with the arrays of each batch by name. With an attribute `threads` that is true, those on GPUs of this machine
+    are threads of this process, one for each GPU: their Python code must take little time, and load kernels `alone`
+    (`wlm.interop`).
     """
 
     report: Callable[[float], None] = staticmethod(lambda share: None)
@@ -88,7 +90,8 @@ class Place(NamedTuple):
     Attributes:
         device: "cpu", "cuda" or "cuda:N". Several workers on "cuda" are spread over the GPUs of this machine.
         workers: Number of workers; None: one, on a cluster as many as have room.
-        cluster: Address of a Ray cluster, whose workers take two CPUs or a GPU each; None: processes of this machine.
+        cluster: Address of a Ray cluster, whose workers take two CPUs or a GPU each; None: processes of this machine,
+            or threads for its GPUs, see `Whole`.
     """
 
     device: str = "cpu"
@@ -126,8 +129,13 @@ def start_workers(worker: tuple, place: Place, tasks: int) -> Workers:
     if place.cluster is not None:
         share = {"CPU": float(CPU_LANES)} if place.device == "cpu" else {"GPU": 1.0}
         return Actors(make, (place.device, *arguments), place.workers, tasks, place.cluster, share)
+    threads = getattr(make, "threads", False) and place.device != "cpu"
+    if threads:
+        devices = list(dict.fromkeys(devices))
     if len(devices) == 1:
         return Here(make(devices[0], *arguments))
+    if threads:
+        return Threads([make(each, *arguments) for each in devices])
     return Processes(make, [(each, *arguments) for each in devices])
 
 
@@ -137,16 +145,10 @@ def run(
     """Runs tasks by workers, see `start_workers`, of a class that has the methods of `Whole`.
 
     Tasks begin in their order. Those of lost workers begin again, and `meter` reports the progress, with `done` steps
-    before. The checkpoint has the states of running tasks; the caller adds results, which are written when the work
-    is stopped.
-
-    Yields:
-        Each finished task with its result.
-
-    Raises:
-        WlmError: A task failed, a saved state is wrong, or the workers of a task died again and again.
-        KeyboardInterrupt: Raised by the progress callback; the states of running tasks have been saved.
-    """
+    before. The checkpoint has the states of running tasks; the caller adds results, which are written when the work is
+    stopped. Yields each finished task with its result. Raises a WlmError if a task failed, a saved state is wrong, or
+    the workers of a task died again and again. Raises the KeyboardInterrupt of the progress callback, once the states
+    of running tasks have been saved."""
     if tasks:
         try:
             with closing(start_workers(worker, place, len(tasks))) as pool:
@@ -194,7 +196,7 @@ class _Dispatch:
         self._waiting = deque(tasks)
         self._running: dict[int, _Running] = {}
         self._dead: set[int] = set()
-        self._compiled: set[Any] = {None}
+        self._compiled = {task.kind for task in tasks} if isinstance(workers, Threads) else {None}
         self._figures: Mapping[str, float] = {}  # of the task that advanced last
         self._states: dict[int, dict[str, np.ndarray]] | None = None  # the states of a save that is under way
         self._stop: KeyboardInterrupt | None = None

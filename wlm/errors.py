@@ -21,10 +21,14 @@ def printable(text: str) -> str:
 
 def one_line(text: object, limit: int = _LIMIT) -> str:
     """Joins the lines of a message, escapes control characters, and truncates the result to `limit` characters, "..."
-    at its end.
-    """
+    at its end."""
     line = printable(" ".join(part.strip() for part in str(text).splitlines() if part.strip()))
     return line if len(line) <= limit else line[: limit - 3].rstrip() + "..."
+
+
+def counted(number: int, noun: str, plural: str = "") -> str:
+    """Returns a number of things in words: "1 texel", "2 texels"; `plural` is that of nouns without a final s."""
+    return f"{number} {noun if number == 1 else plural or f'{noun}s'}"
 
 
 class WlmError(Exception):

@@ -1,6 +1,7 @@
 """Interoperation of Warp and torch: devices, arrays, streams and CUDA graphs."""
 
 import gc
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import fields, replace
@@ -12,6 +13,10 @@ import torch
 import warp as wp
 
 from wlm.errors import WlmError
+
+alone = threading.RLock()
+"""To be held while kernels are loaded or launched for the first time and while a graph is captured: Warp's tables of
+kernels and captures are not made for several threads."""
 
 _TENSORS = {
     int: (torch.int32, ()),
@@ -33,10 +38,7 @@ def available_devices() -> list[str]:
 
 def check_device(name: str) -> str:
     """Checks that the device "cpu", "cuda" (the first GPU) or "cuda:N" exists, without falling back to another one.
-
-    Returns:
-        The name that both Warp and torch accept: "cpu" or "cuda:N".
-    """
+    Returns the name that both Warp and torch accept: "cpu" or "cuda:N"."""
     full_name = "cuda:0" if name == "cuda" else name
     devices = available_devices()
     if full_name not in devices:
@@ -66,6 +68,19 @@ def free_memory(device: wp.Device) -> int:
         if line.startswith("MemAvailable:"):
             return int(line.split()[1]) * 1024
     raise WlmError("/proc/meminfo: expected an entry MemAvailable, found none")
+
+
+@contextmanager
+def one_thread(device: str = "cpu") -> Iterator[None]:
+    """Limits torch to one thread on the CPU. Short calls of torch take up to ten times as long with a second thread on
+    a busy machine, and threads that call torch side by side need no others."""
+    threads = torch.get_num_threads()
+    try:
+        if device == "cpu":
+            torch.set_num_threads(1)
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def to_warp(tensor: torch.Tensor, dtype: Any = None) -> wp.array:
@@ -105,21 +120,35 @@ def stream(device: str) -> Iterator[torch.cuda.Stream | None]:
         yield side
         return
     side.wait_stream(outer)
-    with torch.cuda.stream(side), wp.ScopedStream(warp_side, sync_enter=True, sync_exit=True):
+    with torch.cuda.stream(side), launch_on(warp_side, sync=True):
         yield side
     outer.wait_stream(side)
 
 
 @contextmanager
-def no_collection() -> Iterator[None]:
-    """Disables garbage collection inside the block: freeing an older graph would invalidate a running capture."""
-    collecting = gc.isenabled()
-    gc.disable()
+def launch_on(stream: wp.Stream, sync: bool = False) -> Iterator[None]:
+    """Runs Warp's work for a stream's device on the stream; with `sync` both the stream and the one before wait for the
+    work of the other. Unlike `wp.ScopedStream` it does not change Warp's default device, which all threads share."""
+    device, before = stream.device, stream.device.stream
+    device.set_stream(stream, sync)
     try:
         yield
     finally:
-        if collecting:
-            gc.enable()
+        device.set_stream(before, sync)
+
+
+@contextmanager
+def no_collection() -> Iterator[None]:
+    """Disables garbage collection inside the block, in which a graph is captured, `alone`: freeing an older graph would
+    invalidate a running capture."""
+    with alone:
+        collecting = gc.isenabled()
+        gc.disable()
+        try:
+            yield
+        finally:
+            if collecting:
+                gc.enable()
 
 
 def torch_memory(device: torch.device) -> Callable[[tuple[int, ...], Any], wp.array]:
@@ -207,10 +236,15 @@ class LaunchGraph(StepGraph):
             self._step()
             return
         if self._launches is None:
+            self.capture()
+        wp.capture_launch(self._launches)
+
+    def capture(self) -> None:
+        """Captures the step on CUDA, before its first call, which then replays it; its modules must be loaded."""
+        if self._device != "cpu":
             with no_collection(), wp.ScopedCapture(self._device, force_module_load=False) as capture:
                 self._step()
-            self._launches = capture.graph
-        wp.capture_launch(self._launches)
+            self._launches, self._eager_left = capture.graph, 0
 
 
 def fork(device: str, works: Sequence[Callable[[], None]]) -> None:
@@ -224,7 +258,7 @@ def fork(device: str, works: Sequence[Callable[[], None]]) -> None:
     branches = [_side_stream(device, 1 + number) for number in range(len(works))]
     for work, (side, warp_side) in zip(works, branches, strict=True):
         side.wait_stream(outer)
-        with torch.cuda.stream(side), wp.ScopedStream(warp_side, sync_enter=False):
+        with torch.cuda.stream(side), launch_on(warp_side):
             work()
     for side, _ in branches:
         outer.wait_stream(side)

@@ -23,7 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from wlm.errors import WlmError
+from wlm.errors import WlmError, counted
 from wlm.texels import fill_gaps
 
 METRICS = ("psnr", "ssim", "flip")
@@ -287,12 +287,9 @@ class LostLight:
         self.worst: tuple[float, float, str] | None = None
 
     def add(self, reference: np.ndarray | torch.Tensor, decoded: np.ndarray | torch.Tensor, where: str = "") -> None:
-        """Adds a group of points, such as a tile at one time of day or a whole probe set.
-
-        Args:
-            reference, decoded: [K, C], on one device; a point's light is the largest magnitude of its channels.
-            where: Name of the group in the warning.
-        """
+        """Adds a group of points, such as a tile at one time of day or a whole probe set. `reference` and `decoded` are
+        [K, C], on one device; a point's light is the largest magnitude of its channels. `where` is the name of the
+        group in the warning."""
         if not len(reference):
             return
         reference, decoded = torch.as_tensor(reference), torch.as_tensor(decoded)
@@ -311,24 +308,27 @@ class LostLight:
             if 2 * off > int(lit.count_nonzero()):
                 self.hidden += off
 
-    def warnings(self, name: str, point: str, group: str) -> list[str]:
-        """Returns one line for each kind of loss that occurred.
+    def merge(self, other: "LostLight") -> None:
+        """Adds the groups of another search, as if they had been added here in their order."""
+        self.count += other.count
+        self.hidden += other.hidden
+        if other.worst is not None and (self.worst is None or other.worst[0] > self.worst[0]):
+            self.worst = other.worst
 
-        Args:
-            name: Name of the compressed data.
-            point, group: Words for a point and for its group, such as "texel" and "its tile".
-        """
+    def warnings(self, name: str, point: str, group: str) -> list[str]:
+        """Returns one line for each kind of loss that occurred. `name` is the name of the compressed data. `point` and
+        `group` are words for a point and for its group, such as "texel" and "its tile"."""
         lines = []
         if self.worst is not None:
             light, kept, where = self.worst
             lines.append(
-                f"{name}: {_count(self.count, point)} among the brightest of {group} lost more than half of the light; "
-                f"the largest of {light:.4g} decodes to {kept:.4g}{where and f' ({where})'}"
+                f"{name}: {counted(self.count, point)} among the brightest of {group} lost more than half of the "
+                f"light; the largest of {light:.4g} decodes to {kept:.4g}{where and f' ({where})'}"
             )
         if self.hidden:
             lines.append(
-                f"{name}: {_count(self.hidden, point)}, most of {group}, are off by more than half of their own light; "
-                "PSNR hides it, since others are over ten times as bright"
+                f"{name}: {counted(self.hidden, point)}, most of {group}, are off by more than half of their own "
+                "light; PSNR hides it, since others are over ten times as bright"
             )
         return lines
 
@@ -339,10 +339,6 @@ def _largest(values: torch.Tensor) -> torch.Tensor:
     for channel in range(1, values.shape[1]):
         torch.maximum(result, values[:, channel].abs(), out=result)
     return result
-
-
-def _count(number: int, point: str) -> str:
-    return f"1 {point}" if number == 1 else f"{number} {point}s"
 
 
 @dataclass(frozen=True)
@@ -470,12 +466,8 @@ def evaluate_frame(
 
 
 def summarise(frames: Sequence[FrameMetrics], times: Sequence[float] | np.ndarray | None = None) -> Summary:
-    """Averages the scores of a scene's lightmaps over all tiles and lightmaps.
-
-    Args:
-        frames: The scores of each lightmap, in order of time.
-        times: The time of each lightmap; None: 0, 1, 2 and so on.
-    """
+    """Averages the scores of a scene's lightmaps over all tiles and lightmaps. `frames` are the scores of each
+    lightmap, in order of time. `times` has the time of each lightmap; None: 0, 1, 2 and so on."""
     if not frames:
         raise WlmError("summarise: expected at least one lightmap's metrics")
     first = frames[0]

@@ -31,12 +31,7 @@ if TYPE_CHECKING:
     from wlm.bundle import Bundle
 
 # The package that reads the files of each system.
-_PACKAGES = {
-    "lightmap": "wlm.lightmap",
-    "atlas": "wlm.atlas",
-    "probe": "wlm.probe",
-    "smoke-network": "wlm.smoke",
-}
+_PACKAGES = {"lightmap": "wlm.lightmap", "atlas": "wlm.atlas", "probe": "wlm.probe", "smoke-network": "wlm.smoke"}
 _REPORT_EVERY = 0.5  # seconds between two reports of progress
 
 
@@ -48,7 +43,13 @@ Name = Annotated[str, AfterValidator(_printable)]
 """A name from a file, in which spaces replace the control characters that a terminal would obey."""
 
 
-class Settings(BaseModel):
+class Checked(BaseModel):
+    """Base of classes of settings: unknown keys, NaN and infinity are errors."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
+
+
+class Settings(Checked):
     """Settings of the compression, which can be loaded by name: the base of each system's `Profile`.
 
     The docstring under a field becomes its description, from which the command line makes an option's help.
@@ -56,8 +57,6 @@ class Settings(BaseModel):
     Attributes:
         FILES: First part of the names of the profile files, `configs/FILES-NAME.yaml`.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
 
     FILES: ClassVar[str]
 
@@ -67,8 +66,7 @@ class Settings(BaseModel):
     @classmethod
     def load(cls, profile: str | os.PathLike[str] | Self) -> Self:
         """Loads a profile by its name (NAME in `configs/FILES-NAME.yaml`; `FILES` is the class's) or the path of a YAML
-        file; an instance is returned unchanged.
-        """
+        file; an instance is returned unchanged."""
         if isinstance(profile, cls):
             return profile
         path = os.fspath(profile)
@@ -90,14 +88,9 @@ class Settings(BaseModel):
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a long computation has come.
-
-    Attributes:
-        stage: Name of the current stage in a word or two, such as "fit" or "cluster".
-        done, total: Finished steps and all steps of the stage; a total of 0 is unknown.
-        seconds: Time since the work began, seconds.
-        figures: Measured values so far by name and unit, such as `{"PSNR dB": 41.2}`. NaN is unknown.
-    """
+    """How far a long computation has come, `seconds` after it began. `stage` names the current stage in a word or two,
+    such as "fit" or "cluster"; `done` and `total` are its finished steps and all its steps, 0 if unknown. `figures` are
+    values measured so far by name and unit, such as `{"PSNR dB": 41.2}`; NaN is unknown."""
 
     stage: str
     done: int
@@ -112,17 +105,11 @@ stops between two steps."""
 
 
 class Meter:
-    """Reports progress about twice a second.
-
-    Attributes:
-        stage: Name of the stage.
-        seconds: Time since the work began, seconds.
-    """
+    """Reports progress about twice a second. `stage` names the stage, `seconds` is the time since the work began."""
 
     def __init__(self, progress: OnProgress | None, stage: str, total: int, every: float = _REPORT_EVERY) -> None:
         """Starts the clock; `every` is the number of seconds between two reports, and without a callback there are
-        none.
-        """
+        none."""
         self._progress, self.stage, self._total, self._every = progress, stage, total, every
         self._start = self._last = time.perf_counter()
 
@@ -168,13 +155,13 @@ def plain(value: Any) -> Any:
     return value
 
 
-class Header(BaseModel):
+class Header(Checked):
     """Base of the classes that describe and check the settings in a model file's header.
 
     Types are strict: a text is never read as a number, nor a float as a count. NaN and infinity are refused.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+    model_config = ConfigDict(strict=True)
 
 
 class Model:
@@ -192,11 +179,7 @@ class Model:
     DECODER: ClassVar[tuple[str, str]] = ("decode", "Decoder")
 
     def save(self, path: str | os.PathLike[str]) -> int:
-        """Writes the model to one file, whole or not at all.
-
-        Returns:
-            The file's size, bytes.
-        """
+        """Writes the model to one file, whole or not at all. Returns the file's size in bytes."""
         try:
             settings, parts, source = self._encoded()
         except WlmError as error:

@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
-from wlm.errors import WlmError
+from wlm.errors import WlmError, counted
 from wlm.formats.exr import HALF_MAX
 
 REACH = 2
@@ -133,11 +133,8 @@ def _nearest_in_strips(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None
 
 
 def doubts(light: np.ndarray) -> list[str]:
-    """Compares the range of a lightmap [H, W, 3] with what radiance usually is, on some of its texels.
-
-    Returns:
-        One line for each reason why the values may be something else: another unit, an exposure, or screen colours.
-    """
+    """Compares the range of a lightmap [H, W, 3] with what radiance usually is, on some of its texels. Returns one line
+    for each reason why the values may be something else: another unit, an exposure, or screen colours."""
     step = max(1, round((light.size / _SAMPLES) ** 0.5))
     used = light[::step, ::step].reshape(-1, 3)
     red, green, blue = used.T
@@ -179,21 +176,17 @@ def repair(frame: np.ndarray, mask: np.ndarray, where: str) -> list[str]:
     if not all_finite:
         broken = np.count_nonzero(mask & ~finite)
         if broken:
-            notes.append(f"{_texels(broken)} NaN or infinite: replaced by the nearest finite one in the mask")
+            notes.append(f"{counted(broken, 'texel')} NaN or infinite: replaced by the nearest finite one in the mask")
             frame[mask & ~finite] = fill_gaps(frame, good)[mask & ~finite]
         frame[~mask & ~finite] = 0.0
         least, greatest = float(frame.min()), float(frame.max())
     if least < 0:
         negative = np.count_nonzero((frame < 0).any(axis=2) & good)
         if negative:
-            notes.append(f"{_texels(negative)} negative: clamped to 0")
+            notes.append(f"{counted(negative, 'texel')} negative: clamped to 0")
     if greatest > HALF_MAX:
         bright = np.count_nonzero((frame > HALF_MAX).any(axis=2) & good)
         if bright:
-            notes.append(f"{_texels(bright)} above {HALF_MAX:,.0f}: clamped to it")
+            notes.append(f"{counted(bright, 'texel')} above {HALF_MAX:,.0f}: clamped to it")
     np.clip(frame, 0.0, HALF_MAX, out=frame)
     return notes
-
-
-def _texels(count: int) -> str:
-    return f"{count} {'texel' if count == 1 else 'texels'}"

@@ -1,4 +1,4 @@
-"""Parallel work: in threads, or by objects in this process, in other processes of this machine, or on a Ray cluster.
+"""Parallel work: in threads, or by objects in this process or its threads, in other processes, or on a Ray cluster.
 
 Callers submit method calls, one at a time per object, and receive the results in order of completion.
 Processes on this machine use the standard library alone: Ray takes seconds to start, needs 250 MB and leaves log
@@ -28,7 +28,7 @@ from wlm.errors import WlmError
 _PROTOCOL = 5  # large arrays aren't copied
 _PATIENCE = 2.0  # seconds that an idle process gets to end by itself
 _ANSWER = 10.0  # seconds that a cluster gets to accept a connection
-_THREADS = 8  # maximum number: each needs the memory of its call
+_THREADS = 16  # maximum number: each needs the memory of its call
 _TOLD = 2000  # bytes read from the error output of a dead process
 
 _Item = TypeVar("_Item")
@@ -58,27 +58,27 @@ def each(call: Callable[[_Item], _Answer], items: Iterable[_Item]) -> Iterator[_
 
 
 class Workers(ABC):
-    """Worker objects of one class, numbered from 0.
-
-    Attributes:
-        count: Number of workers.
-        remote: Whether the workers run in parallel with this process.
-    """
+    """Worker objects of one class, numbered from 0 to `count` - 1; `remote` tells whether they run in parallel with
+    this process."""
 
     count: int
     remote = True
+    _answers: queue.SimpleQueue[tuple[int, Any]]
 
     @abstractmethod
     def call(self, number: int, method: str, *arguments: Any) -> None:
         """Starts a method call on a worker that has no call in progress."""
 
-    @abstractmethod
     def wait(self, seconds: float) -> tuple[int, Any] | None:
         """Waits for the next result, at most some seconds; None if there was none in that time.
 
         Returns the worker's number and the method's return value, the exception that it raised, or `Lost` if the worker
         no longer exists.
         """
+        try:
+            return self._answers.get(timeout=seconds)
+        except queue.Empty:
+            return None
 
     @abstractmethod
     def renew(self, number: int) -> None:
@@ -116,6 +116,34 @@ class Here(Workers):
         self.worker.close()
 
 
+class Threads(Workers):
+    """Workers in threads of this process, for work that leaves Python idle, as that of several GPUs does. They share
+    the process's data and kernels, and start at once; they end after their current call."""
+
+    def __init__(self, workers: list[Any]) -> None:
+        """Takes worker objects as `Here` does; only one thread at a time calls an object's methods."""
+        self.count, self._workers, self._answers = len(workers), workers, queue.SimpleQueue()
+        self._pool = ThreadPoolExecutor(self.count)
+
+    def call(self, number: int, method: str, *arguments: Any) -> None:
+        self._pool.submit(self._run, number, method, arguments)
+
+    def _run(self, number: int, method: str, arguments: tuple[Any, ...]) -> None:
+        try:
+            answer = getattr(self._workers[number], method)(*arguments)
+        except Exception as error:
+            answer = error
+        self._answers.put((number, answer))
+
+    def renew(self, number: int) -> None:
+        raise AssertionError("a thread is not lost")
+
+    def close(self) -> None:
+        self._pool.shutdown()
+        for worker in self._workers:
+            worker.close()
+
+
 class Processes(Workers):
     """Workers in separate processes on this machine.
 
@@ -123,15 +151,11 @@ class Processes(Workers):
     """
 
     def __init__(self, make: type, arguments: list[tuple[Any, ...]]) -> None:
-        """Starts the processes.
-
-        Args:
-            make: The class of the workers, from an importable module.
-            arguments: Constructor arguments of each worker.
-        """
+        """Starts the processes. `make` is the class of the workers, from an importable module. `arguments` are the
+        constructor arguments of each worker."""
         self.count = len(arguments)
         self._make, self._arguments = make, arguments
-        self._answers: queue.SimpleQueue[tuple[int, Any]] = queue.SimpleQueue()
+        self._answers = queue.SimpleQueue()
         self._processes: dict[int, subprocess.Popen[bytes]] = {}
         self._errors: dict[int, IO[bytes]] = {}
         try:
@@ -145,12 +169,6 @@ class Processes(Workers):
         # If the process has ended, `wait` reports it.
         with suppress(OSError):
             _send(self._processes[number].stdin, (method, arguments))
-
-    def wait(self, seconds: float) -> tuple[int, Any] | None:
-        try:
-            return self._answers.get(timeout=seconds)
-        except queue.Empty:
-            return None
 
     def renew(self, number: int) -> None:
         self._end(number)

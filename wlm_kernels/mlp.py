@@ -67,11 +67,7 @@ def slope_tanh(x: float, gate: float) -> float:
     return gate + 2.0 * x * gate * (1.0 - gate) * (0.7978845608028654 + 0.10703222440890037 * x * x)
 
 
-_GELU = {
-    "exact": (gate_exact, slope_exact),
-    "tanh": (gate_tanh, slope_tanh),
-    "fast": (gate_fast, slope_tanh),
-}
+_GELU = {"exact": (gate_exact, slope_exact), "tanh": (gate_tanh, slope_tanh), "fast": (gate_fast, slope_tanh)}
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from wlm.atlas.listing import read_listing
 from wlm.atlas.stored import with_uvs
 from wlm.errors import WlmError
 from wlm.formats.exr import HALF_MAX, write_exr
-from wlm.formats.gltf import document_from_arrays, read_gltf
+from wlm.formats.gltf import document_from_meshes, read_gltf
 from wlm.formats.gltf_writer import Replacement, write_glb
 from wlm.inspection import inspect
 
@@ -45,7 +45,7 @@ def _chart() -> np.ndarray:
 
 def _files(folder: Path, second: np.ndarray | None = None) -> tuple[Path, Path]:
     """Writes a mesh, with a second UV set if one is given, and its lightmap."""
-    document, primitive = document_from_arrays(POSITION, TRIANGLE, UV, "square")
+    document, (primitive,) = document_from_meshes([("square", POSITION, TRIANGLE, UV)], "square")
     new = [] if second is None else [Replacement(primitive, np.arange(4), TRIANGLE, second)]
     write_glb(folder / "square.glb", document, new, 1)
     write_exr(folder / "light.exr", _lightmap())

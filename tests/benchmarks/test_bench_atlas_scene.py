@@ -15,7 +15,7 @@ from benchmarks.rivals.scene_parts import scene_parts
 from wlm.atlas.evaluation import compare
 from wlm.atlas.model import SOURCE_BITS
 from wlm.formats.exr import write_exr
-from wlm.formats.gltf import document_from_arrays
+from wlm.formats.gltf import document_from_meshes
 from wlm.formats.gltf_writer import write_glb
 from wlm.lightmap.data import from_arrays
 from wlm.ops.raster import texture
@@ -84,7 +84,7 @@ def test_objects_keep_their_light(scene):
 
 
 def test_a_set_is_read_and_what_is_wrong_is_said(tmp_path):
-    document, _ = document_from_arrays(*arrays(), "boxes")
+    document, _ = document_from_meshes([("boxes", *arrays())], "boxes")
     write_glb(tmp_path / "scene.glb", document, [], 1)
     for name, light in zip("ab", lights(), strict=True):
         write_exr(tmp_path / f"{name}.exr", light)

@@ -12,7 +12,7 @@ import pytest
 from builders.gltf_maker import GltfMaker
 
 from wlm.errors import WlmError
-from wlm.formats.gltf import GltfDocument, components, document_from_arrays, read_gltf
+from wlm.formats.gltf import GltfDocument, components, document_from_meshes, read_gltf
 from wlm.formats.gltf_writer import Replacement, write_glb
 
 POINTS = np.array([[0, 0, 0], [2, 0, 0], [0, 3, 0], [2, 3, 1], [9, 9, 9]], np.float32)
@@ -220,7 +220,7 @@ def test_indices_are_as_wide_as_they_must_be(tmp_path, count, component):
     points = np.zeros((count, 3))
     points[:, 0] = np.arange(count)
     triangle = np.arange(count // 3 * 3).reshape(-1, 3)
-    document, primitive = document_from_arrays(points, triangle, points[:, :2], "many")
+    document, (primitive,) = document_from_meshes([("many", points, triangle, points[:, :2])], "many")
     replacement = Replacement(primitive, np.arange(count), np.vstack([triangle, [[0, 1, count - 1]]]), points[:, 1:])
     write_glb(tmp_path / "out.glb", document, [replacement], 1)
     after = _check_rules(tmp_path / "out.glb")
@@ -230,7 +230,7 @@ def test_indices_are_as_wide_as_they_must_be(tmp_path, count, component):
 
 
 def test_sets_that_are_missing_between_are_filled(tmp_path):
-    document, primitive = document_from_arrays(POINTS, TRIANGLES, PLACES, "few")
+    document, (primitive,) = document_from_meshes([("few", POINTS, TRIANGLES, PLACES)], "few")
     write_glb(tmp_path / "out.glb", document, [Replacement(primitive, GATHER, CORNERS, NEW_UV)], 3)
     _check_rules(tmp_path / "out.glb")
     (found,) = read_gltf(tmp_path / "out.glb")[1]

@@ -120,7 +120,7 @@ def test_six_way_against_reference(device: str, turned, inside, kind, extinction
     hot = np.random.default_rng(1).uniform(0, 1, scene.density.shape).astype(np.float16).astype(np.float32)
     monkeypatch.setattr(march_six, "_SLAB_BYTES", 16 * scene.height * scene.width * 5)
     result = _six(scene, device, TYPES[kind], (hot, 0.2), step=0.5, g=0.1)
-    expected = reference.six_way(scene, 1 / 64, 0.1, hot, 0.2)
+    expected = reference.six_way(scene, 1 / 32, 0.1, hot, 0.2)
     assert (expected[:6].max() > 0.2) == (extinction > 0)
     # Light of 1 is that of white smoke; emission follows the steps of the density alone.
     for planes, most in ((slice(6), 1e-3), (6, 1e-3), (7, (0.1 if voxel else 1e-3) * expected[7].max())):

@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import tracemalloc
 from fractions import Fraction
 from pathlib import Path
@@ -17,6 +18,7 @@ from builders.worker_pools import Several
 
 import wlm
 from wlm import dispatch
+from wlm.dispatch import Place
 from wlm.errors import WlmError
 from wlm.formats import scratch
 from wlm.formats.artifact import read_artifact, write_artifact
@@ -25,7 +27,8 @@ from wlm.formats.parts import Part
 from wlm.lightmap import fit
 from wlm.lightmap.data import from_arrays, load
 from wlm.lightmap.fit import open_checkpoint
-from wlm.workers import Processes
+from wlm.lightmap.trainer import Trainer
+from wlm.workers import Processes, Threads
 
 PROFILE = tiny_profile(steps=40)
 
@@ -73,6 +76,41 @@ def test_what_several_workers_were_at_is_resumed_by_another_number(lightmaps, tm
     model = fit.compress(lightmaps, PROFILE, progress=lambda now: steps.append(now.done), checkpoint=checkpoint)
     # Steps that waiting batches were at count once their batch begins.
     assert bytes_of(model, tmp_path) == whole and steps[-1] == 240 and len(steps) <= (240 - 100) / 5
+
+
+def in_threads(worker, place, tasks):
+    """Workers on two GPUs, here both the CPU."""
+    return Threads([worker[0](place.device, *worker[1:]) for _ in range(min(2, tasks))])
+
+
+def test_threads_of_two_gpus_share_a_fit_evenly_and_one_resumes_it(lightmaps, tmp_path, monkeypatch):
+    report_always(monkeypatch)
+    monkeypatch.setattr(fit, "CPU_TILES", None)
+    whole = bytes_of(fit.compress(lightmaps, PROFILE), tmp_path)
+    checkpoint = fit.open_checkpoint(tmp_path / "a.wlm", lightmaps, PROFILE)
+    with monkeypatch.context() as patched:
+        patched.setattr(dispatch, "start_workers", in_threads)
+        patched.setattr(Place, "devices", lambda self: ["cpu", "the other"])
+        patched.setattr(dispatch, "_SLICE", 0.0)
+        assert bytes_of(fit.compress(lightmaps, PROFILE), tmp_path) == whole
+        with pytest.raises(KeyboardInterrupt):
+            fit.compress(lightmaps, PROFILE, progress=stop_after(30), checkpoint=checkpoint)
+    again = fit.open_checkpoint(tmp_path / "a.wlm", lightmaps, PROFILE, resume=True)
+    assert again.split == 2 and any(len((again.running(number) or {"loss": ()})["loss"]) == 3 for number in (0, 1))
+    assert bytes_of(fit.compress(lightmaps, PROFILE, checkpoint=again), tmp_path) == whole
+    settings = read_artifact(again.path).settings | {"split": -1}
+    write_artifact(again.path, again.system, settings, {}, lightmaps.source)
+    with pytest.raises(WlmError, match="partial: split: expected an integer of at least 0, found -1"):
+        fit.open_checkpoint(tmp_path / "a.wlm", lightmaps, PROFILE, resume=True)
+
+
+def test_an_error_in_one_thread_ends_all(lightmaps, monkeypatch):
+    monkeypatch.setattr(dispatch, "start_workers", in_threads)
+    monkeypatch.setattr(Trainer, "check", lambda trainer: exec("raise WlmError('tile 4: the fit diverged')"))
+    before = threading.active_count()
+    with pytest.raises(WlmError, match="^tile 4: the fit diverged$"):
+        fit.compress(lightmaps, PROFILE, workers=2)
+    assert threading.active_count() == before
 
 
 def test_a_batch_that_no_worker_survives_is_named(lightmaps, monkeypatch):

@@ -49,9 +49,10 @@ def test_nothing_is_said_of_light_that_is_kept():
 
 
 def test_losses_of_several_groups_are_added():
-    lost = LostLight()
-    for light in (3.0, 8.0, 5.0):
-        lost.add(np.array([[light], [light]]), np.array([[0.0], [light]]), f"at {light:g}")
+    lost, other = LostLight(), LostLight()
+    for own, light in ((lost, 3.0), (other, 8.0), (other, 5.0)):
+        own.add(np.array([[light], [light]]), np.array([[0.0], [light]]), f"at {light:g}")
+    lost.merge(other)
     assert (lost.count, lost.worst, lost.hidden) == (3, (8.0, 0.0, "at 8"), 0)
 
 

@@ -46,22 +46,21 @@ def dominant(levels: np.ndarray) -> tuple[int, int, int]:
     return min(counts, key=lambda key: (-counts[key], key))
 
 
-def _doubled(samples: dict) -> dict:
+def _doubled(grid: np.ndarray) -> np.ndarray:
     """Puts a sample between every two neighbours of the lattice, by their mean."""
-    made = {tuple(2 * c for c in at): colour for at, colour in samples.items()}
-    for (i, j, k), colour in samples.items():
-        for other in ((i + 1, j - 1, k), (i + 1, j, k - 1), (i, j + 1, k - 1)):
-            if other in samples:
-                made[tuple(a + b for a, b in zip((i, j, k), other, strict=True))] = (colour + samples[other]) / 2
+    made = np.full((2 * len(grid) - 1, 2 * len(grid) - 1, 3), np.nan)
+    made[::2, ::2] = grid
+    made[1::2, ::2], made[::2, 1::2] = (grid[1:] + grid[:-1]) / 2, (grid[:, 1:] + grid[:, :-1]) / 2
+    made[1::2, 1::2] = (grid[1:, :-1] + grid[:-1, 1:]) / 2
     return made
 
 
-def upsampled(samples: np.ndarray, size: int, target: int) -> dict:
-    """The colours at (i, j, k) of a larger lattice."""
-    where = np.rint(barycentrics(size) * (size - 1)).astype(int)
-    made = {tuple(map(int, at)): colour for at, colour in zip(where, np.asarray(samples, float), strict=True)}
-    while size < target:
-        made, size = _doubled(made), 2 * size - 1
+def upsampled(samples: np.ndarray, size: int, target: int) -> np.ndarray:
+    """The colours at the first two weights of a larger lattice, [T, T, 3], NaN beyond it."""
+    made = np.full((size, size, 3), np.nan)
+    made[*np.rint(barycentrics(size)[:, :2] * (size - 1)).astype(int).T] = samples
+    while len(made) < target:
+        made = _doubled(made)
     return made
 
 
@@ -69,11 +68,8 @@ def distances(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Dist of 8-bit patches [N, 3] and [N', 3] (eq. 2) with vertex k of b on vertex p[k] of a, in all six orders."""
     sizes = [round((2 * len(values)) ** 0.5 - 0.5) for values in (a, b)]
     a, b = (upsampled(values, size, max(sizes)) for values, size in zip((a, b), sizes, strict=True))
-    found = []
-    for p in ORDERS:
-        total = sum(np.abs(colour - b[at[p[0]], at[p[1]], at[p[2]]]).sum() for at, colour in a.items())
-        found.append(total / (3 * 255 * len(a)))
-    return np.array(found)
+    at = np.rint(barycentrics(len(a)) * (len(a) - 1)).astype(int).T
+    return np.array([np.abs(a[at[0], at[1]] - b[at[p[0]], at[p[1]]]).mean() / 255 for p in ORDERS])
 
 
 def adjacency(patches: list[np.ndarray], threshold: float, colour_threshold: float) -> np.ndarray:

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 import wlm
 from wlm.cli.app import app
 from wlm.errors import WlmError
-from wlm.formats.gltf import document_from_arrays
+from wlm.formats.gltf import document_from_meshes
 from wlm.formats.gltf_writer import write_glb
 from wlm.probe.data import save_probes
 from wlm.probe.sphere import basis
@@ -80,7 +80,7 @@ def lightmaps(tmp_path_factory):
     small_sets.write_set(folder / "set", given)
     corners = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
     uv = np.array([[0.0, 1], [1, 1], [1, 0], [0, 0]])
-    document, _ = document_from_arrays(corners, np.array([[0, 1, 2], [0, 2, 3]]), uv, "quad")
+    document, _ = document_from_meshes([("quad", corners, np.array([[0, 1, 2], [0, 2, 3]]), uv)], "quad")
     write_glb(folder / "quad.glb", document, [], 0)
     return folder
 
@@ -181,7 +181,7 @@ def test_probes_as_balls_and_gaussians(tmp_path, show):
     save_probes(tmp_path / "room.npz", places, probe_sets.synthetic(60).values)
     low, high = places.min(0), places.max(0)
     floor = np.array([low, [high[0], low[1], low[2]], [low[0], low[1], high[2]]])
-    document, _ = document_from_arrays(floor, np.array([[0, 2, 1]]), np.zeros((3, 2)), "floor")
+    document, _ = document_from_meshes([("floor", floor, np.array([[0, 2, 1]]), np.zeros((3, 2)))], "floor")
     write_glb(tmp_path / "floor.glb", document, [], 0)
     window = show(tmp_path / "room.wlm", original=tmp_path / "room.npz", mesh=tmp_path / "floor.glb")
     assert window.scene.views == ("balls", "gaussians")

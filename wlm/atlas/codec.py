@@ -81,11 +81,8 @@ class _Header(Header):
 
 def encode(model: AtlasModel) -> tuple[dict[str, Any], dict[str, np.ndarray], str]:
     """Returns the settings, the arrays (parts) and the source hash for a model's file. Times are left out, so that
-    compressing twice with one seed gives equal files.
-
-    Raises:
-        ValueError: The model stores no triangles, or its UVs are not rounded to 16 bits.
-    """
+    compressing twice with one seed gives equal files. Raises a ValueError if the model stores no triangles, or its UVs
+    are not rounded to 16 bits."""
     stored = model.stored
     if stored is None:
         raise ValueError(f"{model.name}: the model has no triangles: expected one that compress or load made")
@@ -135,13 +132,9 @@ def sizes(model: AtlasModel) -> tuple[int, int]:
 
 
 def decode(artifact: Artifact) -> AtlasModel:
-    """Reconstructs an atlas model from a file's content, exactly as it was written.
-
-    Raises:
-        WlmError: A setting is wrong, a block's bits are invalid in its format, the triangles are damaged, or the
-            package that decodes blocks isn't installed.
-        ValueError, LookupError, TypeError, AttributeError: The parts don't match the settings.
-    """
+    """Reconstructs an atlas model from a file's content, exactly as it was written. Raises a WlmError if a setting is
+    wrong, a block's bits are invalid in its format, the triangles are damaged, or the package that decodes blocks isn't
+    installed. Raises a ValueError, LookupError, TypeError or AttributeError if the parts don't match the settings."""
     header = check_settings(_Header, artifact.settings, "setting ")
     for size in header.sizes:
         check_sides("size", *size[::-1])

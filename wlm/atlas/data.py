@@ -25,7 +25,7 @@ from wlm.atlas.coverage import covered_texels, touched_texels
 from wlm.atlas.listing import Listing, SheetFiles, is_listing, read_listing
 from wlm.atlas.matching import all_by_name, chart_map, choose_mesh, misfits, named, replace_strays
 from wlm.atlas.materials import EXTENSIONS, Readings, Rectangle, own_lightmaps, settle, slot_readings
-from wlm.errors import WlmError
+from wlm.errors import WlmError, counted
 from wlm.formats.channels import read_encoded
 from wlm.formats.exr import CROPPED
 from wlm.formats.gltf import Arrays, GltfDocument, GltfPrimitive, document_from_meshes, read_gltf
@@ -380,8 +380,7 @@ def place_objects(
     where: str, primitives: list[GltfPrimitive], uv_set: int, objects: Sequence[Placed], masks: Sequence[np.ndarray]
 ) -> tuple[tuple[Sheet, ...], np.ndarray]:
     """Makes a model's sheets, without lightmaps, from the triangles in its file. Also returns the corners of all B
-    triangles that no sheet lights, float64 [B, 3, 3].
-    """
+    triangles that no sheet lights, float64 [B, 3, 3]."""
     by_node: dict[int, list[GltfPrimitive]] = {}
     for each in primitives:
         by_node.setdefault(each.node, []).append(each)
@@ -457,7 +456,7 @@ def _select(
     if not skipped:
         return selected, uv_set, []
     line = (
-        f"{where}: {_count(len(skipped), 'primitive')} of {len(primitives)} without TEXCOORD_{uv_set}, first "
+        f"{where}: {counted(len(skipped), 'primitive')} of {len(primitives)} without TEXCOORD_{uv_set}, first "
         f"{skipped[0].name}: left out"
     )
     return selected, uv_set, [line]
@@ -506,7 +505,7 @@ def _tiled(
             if number not in listing.tiles:
                 at = ", ".join(f"{x:.3g}" for x in middle[tile == number][0])
                 raise WlmError(
-                    f"{where}: {each.name}: {_count(int((tile == number).sum()), 'triangle')} at UV ({at}) of "
+                    f"{where}: {each.name}: {counted(int((tile == number).sum()), 'triangle')} at UV ({at}) of "
                     f"TEXCOORD_{uv_set}: expected UDIM tiles {', '.join(map(str, listing.tiles))}, which have lightmaps"
                 )
             here = tile == number
@@ -606,7 +605,7 @@ def _checked(
     if outside:
         _check_inside(where, position, uv, triangle, uv_set, alternatives)
         warnings.append(
-            f"{name}: {_count(outside, 'vertex', 'vertices')} with UVs outside [0, 1], by up to {beyond.max():.3g}: "
+            f"{name}: {counted(outside, 'vertex', 'vertices')} with UVs outside [0, 1], by up to {beyond.max():.3g}: "
             "clamped"
         )
         uv = uv.clip(0.0, 1.0)
@@ -615,7 +614,7 @@ def _checked(
     if flat == len(active):
         raise WlmError(f"{where}: no triangle has an area in space and in TEXCOORD_{uv_set}")
     if flat:
-        warnings.append(f"{name}: {_count(flat, 'triangle')} without area in space or in UV: left out")
+        warnings.append(f"{name}: {counted(flat, 'triangle')} without area in space or in UV: left out")
     if len(lightmaps):
         chart = chart_map(position, uv, triangle[active], *lightmaps.shape[1:3])
         used = f"TEXCOORD_{uv_set}"
@@ -653,7 +652,7 @@ def _checked_light(
     coverage = covered_texels(uv, triangle, height, width).numpy()
     overlaps = np.count_nonzero(coverage > 1)
     if overlaps:
-        warnings.append(f"{name}: {_count(overlaps, 'texel')} in several triangles: their UVs overlap")
+        warnings.append(f"{name}: {counted(overlaps, 'texel')} in several triangles: their UVs overlap")
     if mask is None:
         touched = touched_texels(uv, triangle, height, width)
         # A baker that samples texel centres leaves the fringe of a chart at 0: a gap to fill, not darkness.
@@ -666,12 +665,12 @@ def _checked_light(
         missed, covered = np.count_nonzero((coverage > 0) & ~mask), np.count_nonzero(coverage)
         if missed > _MISSED * covered:
             warnings.append(
-                f"{name}: {_count(missed, 'texel')} of {covered} that triangles cover are outside the mask: "
+                f"{name}: {counted(missed, 'texel')} of {covered} that triangles cover are outside the mask: "
                 f"does it belong to another UV set than {used}, or is it upside down?"
             )
     for lightmap, path in zip(lightmaps, names, strict=False):
         if specks := replace_strays(lightmap, mask, coverage > 0):
-            warnings.append(f"{path}: {_count(specks, 'texel')} in specks far above all other light: replaced")
+            warnings.append(f"{path}: {counted(specks, 'texel')} in specks far above all other light: replaced")
         warnings += [f"{path}: {text}" for text in repair(lightmap, mask, path)]
     return mask, warnings
 
@@ -738,10 +737,6 @@ def _has_area(point: np.ndarray, triangle: np.ndarray) -> np.ndarray:
     else:
         twice_area = np.linalg.norm(np.cross(ab, ac), axis=1)
     return twice_area > 2 * _FLAT
-
-
-def _count(number: int, singular: str, plural: str | None = None) -> str:
-    return f"{number} {singular if number == 1 else plural or singular + 's'}"
 
 
 def _hash(sheets: Sequence[Sheet]) -> str:

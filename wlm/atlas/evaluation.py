@@ -31,10 +31,9 @@ from wlm.atlas.charts import charts, welded
 from wlm.atlas.data import LightmappedScene
 from wlm.atlas.decode import Decoder
 from wlm.atlas.model import AtlasModel
-from wlm.atlas.stages import one_thread
 from wlm.atlas.views import Points, corner_weights, points_at, scene_views, sheet_charts, texel_triangles, visible_uv
 from wlm.errors import WlmError
-from wlm.interop import check_device
+from wlm.interop import check_device, one_thread
 from wlm.metrics import SSIM_WINDOW, picture_error, psnr_from_mse, ssim
 from wlm.ops import raster
 from wlm.ops.views import View, Viewpoint

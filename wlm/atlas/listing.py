@@ -24,7 +24,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from wlm.config import check_settings
 from wlm.errors import WlmError
@@ -33,17 +33,16 @@ from wlm.formats.light import SUFFIXES
 from wlm.formats.limits import INDEX_BYTES
 from wlm.formats.reading import named_file, read_json_file
 from wlm.formats.unity_asset import has_lightmap
+from wlm.system import Header
 
 _Three = Annotated[list[Annotated[float, Field(ge=0.0)]], Field(min_length=3, max_length=3)]
 _Four = Annotated[list[float], Field(min_length=4, max_length=4)]
 _SET_FILE = "set.json"
 
 
-class SheetFiles(BaseModel):
+class SheetFiles(Header):
     """A sheet (a UV layout): the files of its lightmaps, one for each state; its mask, a PNG above 0 where a texel
     belongs to a chart; and arguments of `wlm.atlas.load`."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
     files: Annotated[list[str], Field(min_length=1)]
     name: str | None = None
@@ -53,19 +52,15 @@ class SheetFiles(BaseModel):
     intensity: Annotated[float, Field(ge=0.0)] | _Three = 1.0
 
 
-class ObjectPlace(BaseModel):
+class ObjectPlace(Header):
     """A node and its rectangle in a sheet, v downwards: UV times the first two numbers, plus the last two."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
     node: str
     sheet: int = Field(ge=0)
     scale_offset: _Four = [1.0, 1.0, 0.0, 0.0]
 
 
-class _Content(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
-
+class _Content(Header):
     states: list[str] | None = None
     sheets: Annotated[list[SheetFiles], Field(min_length=1)]
     objects: list[ObjectPlace] | None = None

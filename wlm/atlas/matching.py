@@ -187,15 +187,10 @@ def _bands(height: int, width: int) -> list[slice]:
 
 
 class _Turned(NamedTuple):
-    """A lightmap in one of `_TURNS`.
-
-    Attributes:
-        words: Words for the turn, "" for the lightmap as it is.
-        roughness: Mean squared difference, in octaves, between neighbouring texels of one chart. Squares weigh the
-            edges of charts more than the noise inside: on a room with filled gaps, the right UVs have at most 0.88 of
-            the squares of 23 other layouts, but 1.2 of their mean.
-        black: The number of texels in charts without light.
-    """
+    """A lightmap in one of `_TURNS`, which `words` describe, "" for the lightmap as it is. `black` is the number of
+    texels in charts without light. `roughness` is the mean squared difference, in octaves, between neighbouring texels
+    of one chart: squares weigh the edges of charts more than the noise inside. On a room with filled gaps, the right
+    UVs have at most 0.88 of the squares of 23 other layouts, but 1.2 of their mean."""
 
     words: str
     roughness: float

@@ -193,8 +193,7 @@ class SheetPlace:
     """The place of a sheet (a UV layout with its lightmaps), or of its mip level, in the lookup texture T_c: its name,
     the size of its lightmaps in texels, its first entry's row and column, and its numbers of rows and columns of tiles,
     0 if the method has no tiles. `smaller` is the row in `AtlasModel.table` of the next smaller mip level; 0 if there
-    is none.
-    """
+    is none."""
 
     name: str
     height: int
@@ -330,8 +329,7 @@ class AtlasModel(Model):
 
 def check_area(size: tuple[int, int], texels: int, entries: int) -> None:
     """Checks that a lightmap's height and width are plausible for the numbers of texels of T_p and entries of T_c,
-    since a file of a few bytes must not claim gigabytes.
-    """
+    since a file of a few bytes must not claim gigabytes."""
     check_sides("size", *size[::-1])
     stored = texels + entries
     if math.prod(size) > max(_FREE_TEXELS, _MOST_SHARE * stored):

@@ -44,12 +44,8 @@ def store(scene: LightmappedScene) -> StoredScene:
 
 
 def restore(model: AtlasModel) -> LightmappedScene:
-    """Reconstructs the scene, without lightmaps, from which a model was made.
-
-    Raises:
-        WlmError: The stored glTF file is damaged, or has other triangles than the model.
-        ValueError: The model stores no triangles.
-    """
+    """Reconstructs the scene, without lightmaps, from which a model was made. Raises a WlmError if the stored glTF file
+    is damaged, or has other triangles than the model. Raises a ValueError if the model stores no triangles."""
     stored = model.stored
     if stored is None:
         raise ValueError(f"{model.name}: the model has no triangles: expected one that compress or load made")
@@ -68,11 +64,8 @@ def restore(model: AtlasModel) -> LightmappedScene:
 
 def with_uvs(scene: LightmappedScene, corner_uv: np.ndarray) -> tuple[bytes, int]:
     """Encodes a scene of one sheet with an additional UV set, the corners' new UVs [F, 3, 2], numbered after the last
-    existing set. Returns the bytes of a `.glb` file, and n of the new UV set `TEXCOORD_n`.
-
-    Raises:
-        ValueError: The shape is wrong, or a UV isn't finite.
-    """
+    existing set. Returns the bytes of a `.glb` file, and n of the new UV set `TEXCOORD_n`. Raises a ValueError if the
+    shape is wrong, or a UV isn't finite."""
     (sheet,) = scene.sheets
     corner_uv = np.asarray(corner_uv, np.float32)
     if corner_uv.shape != (len(sheet.triangle), 3, 2) or not np.isfinite(corner_uv).all():

@@ -10,14 +10,7 @@ import numpy as np
 
 from wlm.bake.settings import BakeScene, LightmapSettings
 from wlm.errors import WlmError, one_line
-from wlm.formats.gltf import (
-    GltfDocument,
-    GltfPrimitive,
-    read_gltf,
-    reported,
-    texture_transform,
-    vertex_normals,
-)
+from wlm.formats.gltf import GltfDocument, GltfPrimitive, read_gltf, reported, texture_transform, vertex_normals
 from wlm.formats.gltf_slots import lightmap_uv, texture_picture, usual_set
 from wlm.formats.gltf_writer import Replacement
 from wlm.formats.hdr_blocks import need
@@ -179,10 +172,7 @@ def unwrap(
     document: GltfDocument, primitives: Sequence[GltfPrimitive], settings: LightmapSettings
 ) -> list[Replacement]:
     """Creates UVs in one unit square for all primitives together; UV areas are proportional to areas in the world.
-
-    Returns:
-        A replacement for each primitive that has a triangle with area, its UVs in [0, 1].
-    """
+    Returns a replacement for each primitive that has a triangle with area, its UVs in [0, 1]."""
     uvunwrap = need("uvunwrap", "bake")
     meshes, kept = [], []
     for each in primitives:

@@ -62,8 +62,7 @@ class Tracing:
 class Gathered:
     """Estimated incident light at N points, float32 [N, C], with the standard error of each estimate; `back`, float32
     [N], is the share of first rays that hit the back of a single-sided surface, which indicates a point inside an
-    object.
-    """
+    object."""
 
     mean: np.ndarray
     noise: np.ndarray
@@ -123,11 +122,8 @@ def irradiance(scene: Any, texels: Any, tracing: Tracing, *, report: Any = None)
 
 
 def harmonics(scene: Any, position: np.ndarray, tracing: Tracing, *, report: Any = None) -> Gathered:
-    """Projects radiance at points [N, 3] onto the second-order spherical harmonics of `wlm.probe.sphere.basis`.
-
-    Returns:
-        Estimates with 27 channels: red, green and blue of each coefficient.
-    """
+    """Projects radiance at points [N, 3] onto the second-order spherical harmonics of `wlm.probe.sphere.basis`. Returns
+    estimates with 27 channels: red, green and blue of each coefficient."""
     place = mi.Point3f(np.asarray(position, np.float32).T)
     sky = _Outside(tracing)
 

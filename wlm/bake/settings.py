@@ -16,9 +16,9 @@ model (about 1.5 at a clear noon), times `scale`; other lights use the same unit
 
 from typing import Annotated, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
-from wlm.system import Name
+from wlm.system import Checked, Name
 
 _MOST_LAMPS = 256
 _MOST_HOURS = 10_000
@@ -31,11 +31,7 @@ _Vector = tuple[_Number, _Number, _Number]
 _Hour = Annotated[float, Field(ge=-1e6, le=1e6)]
 
 
-class _Settings(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
-class Daylight(_Settings):
+class Daylight(Checked):
     """Sun and sky by solar time, from Mitsuba's `sunsky` (Hosek and Wilkie 2012, 2013).
 
     Attributes:
@@ -59,7 +55,7 @@ class Daylight(_Settings):
     night: Colour = (0.0, 0.0, 0.0)
 
 
-class Sky(_Settings):
+class Sky(Checked):
     """Environment light that is the same at all hours.
 
     Attributes:
@@ -72,7 +68,7 @@ class Sky(_Settings):
     file: str | None = None
 
 
-class Lamp(_Settings):
+class Lamp(Checked):
     """A point light, or a material whose emission replaces the glTF file's.
 
     Attributes:
@@ -106,7 +102,7 @@ class Lamp(_Settings):
         return on <= hour < off if on <= off else hour >= on or hour < off
 
 
-class LightmapSettings(_Settings):
+class LightmapSettings(Checked):
     """Layout of the lightmap.
 
     Attributes:
@@ -124,17 +120,13 @@ class LightmapSettings(_Settings):
     supersample: int = Field(4, ge=1, le=8)
 
 
-class ProbeSettings(_Settings):
-    """Positions of the probes, which are in a lattice in the geometry's bounding box.
-
-    Attributes:
-        spacing: Distance between neighbouring probes, in metres.
-    """
+class ProbeSettings(Checked):
+    """Positions of the probes: a lattice in the geometry's bounding box, whose points are `spacing` metres apart."""
 
     spacing: float = Field(1.0, gt=0.0, le=1e9)
 
 
-class BakeScene(_Settings):
+class BakeScene(Checked):
     """Settings of a baked scene.
 
     Attributes:

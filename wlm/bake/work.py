@@ -30,8 +30,7 @@ _REPORTS = 100  # progress reports per hour
 class Bake:
     """A scene file and the files that it refers to: the settings, the YAML file, the glTF file, and the environment
     map, float32 [H, W, 3] or None. `source` is a hash of geometry and map, 32 hexadecimal digits of BLAKE2b; `trust`
-    tells whether the files may refer to files outside their folder.
-    """
+    tells whether the files may refer to files outside their folder."""
 
     scene: BakeScene
     path: Path

@@ -111,9 +111,7 @@ def evaluate(
     device: opt.Device = "cpu",
 ) -> None:
     """Compare compressed lightmaps with the originals on rendered views of the scene."""
-    if json_path is not None:
-        console.check_output(json_path, ".json")
-    console.quiet_warp()
+    console.begin(json_path, ".json")
     from wlm.atlas import evaluate
     from wlm.interop import check_device
     from wlm.system import load
@@ -138,8 +136,7 @@ def decode(
     device: opt.Device = "cpu",
 ) -> None:
     """Decode a lightmap in its original layout. The original files are not needed."""
-    console.check_output(output, ".exr")
-    console.quiet_warp()
+    console.begin(output, ".exr")
     from wlm.formats.exr import write_exr
     from wlm.system import load
 

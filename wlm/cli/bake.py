@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from wlm.cli.console import check_output, exclusive, note, note_start, quiet_warp, running, show, table
+from wlm.cli.console import begin, exclusive, note, note_start, quiet_warp, running, show, table
 from wlm.cli.options import PlaceOptions, Resume, Trust, output_option, with_options
 
 app = typer.Typer(help="Make inputs by path tracing: lightmaps and probes, by Mitsuba (extra `bake`).")
@@ -69,8 +69,7 @@ def probes(
 
     Finished hours are kept in OUT.npz.partial; repeat the command with --resume to continue with the next hour.
     """
-    check_output(output, ".npz")
-    quiet_warp()
+    begin(output, ".npz")
     from wlm.bake.probes import bake_probes, write_probes
     from wlm.bake.work import open_checkpoint, open_task
 

@@ -145,23 +145,16 @@ def show_json(value: Any) -> None:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Writes JSON to a file, whole or not at all.
-
-    Raises:
-        WlmError: The file can't be written.
-    """
+    """Writes JSON to a file, whole or not at all. Raises a WlmError if the file can't be written."""
     from wlm.formats.atomic import atomic_write
 
     atomic_write(path, (json.dumps(value, indent=1, allow_nan=False) + "\n").encode())
 
 
 def check_output(path: Path, *suffixes: str) -> None:
-    """Checks before long work that its output file can be written.
-
-    Raises:
-        WlmError: The name has none of the suffixes, which guards against an input given as the output; the folder is
-            missing or read-only; or the path is no regular file.
-    """
+    """Checks before long work that its output file can be written. Raises a WlmError if the name has none of the
+    suffixes, which guards against an input given as the output; the folder is missing or read-only; or the path is no
+    regular file."""
     if path.suffix.lower() not in suffixes:
         raise WlmError(f"{path}: expected a name that ends in {' or '.join(suffixes)}")
     folder = path.resolve().parent
@@ -176,11 +169,8 @@ def check_output(path: Path, *suffixes: str) -> None:
 def exclusive(command: Callable[..., None]) -> Callable[..., None]:
     """Locks the `output` of a command while it runs, and removes temporary files that killed processes left there.
 
-    A folder that the command makes is removed if the command fails before it has a result.
-
-    Raises:
-        WlmError: Another process is writing that output.
-    """
+    A folder that the command makes is removed if the command fails before it has a result. Raises a WlmError if another
+    process is writing that output."""
 
     @functools.wraps(command)
     def run(**values: Any) -> None:
@@ -216,6 +206,13 @@ def quiet_warp() -> None:
     with captured_stderr(lambda line: _MISSING_DRIVER in line):
         wp.init()
     _announce_compilation()
+
+
+def begin(output: Path | None, *suffixes: str) -> None:
+    """Checks the output file of a command, if it has one, see `check_output`, and starts Warp, see `quiet_warp`."""
+    if output is not None:
+        check_output(output, *suffixes)
+    quiet_warp()
 
 
 @functools.cache

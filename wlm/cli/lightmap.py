@@ -27,11 +27,7 @@ _Set = Annotated[
     ),
 ]
 # Columns of the scores of a sheet: heading, attribute, format, factor.
-_SCORES = (
-    ("PSNR, dB", "psnr", ".2f", 1.0),
-    ("SSIM", "ssim", ".4f", 1.0),
-    ("FLIP", "flip", ".4f", 1.0),
-)
+_SCORES = (("PSNR, dB", "psnr", ".2f", 1.0), ("SSIM", "ssim", ".4f", 1.0), ("FLIP", "flip", ".4f", 1.0))
 _SHOWN = (
     ("filtered reads, dB", "seen", ".2f", 1.0),
     ("texels beside charts, dB", "ring", ".2f", 1.0),
@@ -135,9 +131,7 @@ def evaluate(
     The error is also measured as a renderer shows the light: filtered, beside charts, between stored times, across
     tiles, over time, and in views of the set's mesh.
     """
-    if json_path is not None:
-        console.check_output(json_path, ".json")
-    console.quiet_warp()
+    console.begin(json_path, ".json")
     from wlm.interop import check_device
     from wlm.lightmap import evaluate
     from wlm.system import load
@@ -171,8 +165,7 @@ def decode(
     device: opt.Device = "cpu",
 ) -> None:
     """Decode a whole lightmap at one time: the sum of its light groups."""
-    console.check_output(output, ".exr")
-    console.quiet_warp()
+    console.begin(output, ".exr")
     import numpy as np
 
     from wlm.formats.exr import write_planes

@@ -28,8 +28,7 @@ def fit(
     `inputs` of `open_checkpoint` too.
     Returns the input, the model, and the first facts of the result's table.
     """
-    console.check_output(output, ".wlm")
-    console.quiet_warp()
+    console.begin(output, ".wlm")
     package = import_module(f"wlm.{system}")
     checked = package.Profile.load(profile).override(settings, "--")
     data = load()
@@ -58,11 +57,8 @@ def export(
     **options: Any,
 ) -> None:
     """Exports a model to a folder and lists the written files. `time` is that of light probes with several hours.
-    `options` that are None are left out.
-
-    Raises:
-        WlmError: An option has no meaning for the engine, or the folder cannot be written.
-    """
+    `options` that are None are left out. Raises a WlmError if an option has no meaning for the engine, or the folder
+    cannot be written."""
     for option, given in (("shader", shader), ("exact", exact)):
         if given and engine is not None:
             raise WlmError(f"--{option}: has no meaning with --engine {engine}, whose kit has its own shaders")

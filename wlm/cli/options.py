@@ -104,7 +104,7 @@ class PlaceOptions:
     workers: Annotated[
         int | None,
         typer.Option(
-            min=1, metavar="N", help="Processes that share the work; with --device cuda on all GPUs of this machine."
+            min=1, metavar="N", help="Workers that share the work; with --device cuda on all GPUs of this machine."
         ),
     ] = None
     cluster: Annotated[

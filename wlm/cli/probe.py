@@ -119,9 +119,7 @@ def evaluate(
 
     --volume and --views compare the light at one hour, --time.
     """
-    if json_path is not None:
-        console.check_output(json_path, ".json")
-    console.quiet_warp()
+    console.begin(json_path, ".json")
     from wlm.cli.probe_volume import score_pictures, score_walks, show_pictures, show_walks
     from wlm.probe import evaluate, load
     from wlm.system import load as load_model
@@ -168,8 +166,7 @@ def decode(
     Given positions of the same number and bounding box as the compressed probes are taken for these probes, in order.
     Then probes without light (dead probes, such as those in walls) decode to zero.
     """
-    console.check_output(output, ".npz", ".json")
-    console.quiet_warp()
+    console.begin(output, ".npz", ".json")
     from wlm.probe import load_positions, save_probes
     from wlm.probe.places import positions_of
     from wlm.system import load

@@ -41,11 +41,8 @@ def deferred_interrupt() -> Iterator[Callable[[], None]]:
     """Defers the first Ctrl-C or SIGTERM until the work reports that it is between two steps, or ends.
 
     An interrupt in the middle of a step would leave half of it done, and a fit that continued from there would differ
-    from a fit without the interrupt.
-
-    Yields:
-        A function to call between steps; it raises KeyboardInterrupt if a signal has arrived.
-    """
+    from a fit without the interrupt. Yields a function to call between steps; it raises KeyboardInterrupt if a signal
+    has arrived."""
     global _holding
 
     def check() -> None:

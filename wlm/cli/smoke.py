@@ -19,7 +19,7 @@ from wlm.cli.smoke_options import (
     Network,
     SmokeOptions,
     White,
-    check_white,
+    check_positive,
     note_thickness,
     outputs,
     parse_lights,
@@ -176,13 +176,7 @@ def bake(
 @app.command()
 @with_options
 @console.exclusive
-def predict(
-    smoke: Input,
-    output: _Lightmaps,
-    options: FrameOptions,
-    network: Network = None,
-    seed: Seed = 0,
-) -> None:
+def predict(smoke: Input, output: _Lightmaps, options: FrameOptions, network: Network = None, seed: Seed = 0) -> None:
     """Predict six-way lightmaps by a ray march in large steps: like bake, in less time.
 
     With --network a network removes the noise of a coarse march. The table names the method; the files are like those
@@ -230,7 +224,7 @@ def light(
     """
     colour, around = _given_albedo(albedo), None if sky is None else vector("--sky", sky)
     behind = around if background is None else vector("--background", background)
-    check_white(white)
+    check_positive(white=white)
     own, twelve = parse_lights(lights, points, around)
     console.quiet_warp()
     from wlm.formats.exr import write_exr
@@ -310,14 +304,12 @@ def run(
     The lights and the fire of the scene illuminate the smoke with all orders of scattering. A table shows the median
     time of each stage.
     """
-    check_white(white)
+    check_positive(white=white)
     if orders == "all" and network is not None:
         raise WlmError("--network: expected --orders single, since the network makes six-way lightmaps")
     colour = _given_albedo(albedo)
     film_file = output.suffix.lower() == ".mp4"
-    if film_file:
-        console.check_output(output, ".mp4")
-    console.quiet_warp()
+    console.begin(output if film_file else None, ".mp4")
     from wlm.formats.film import film
     from wlm.interop import check_device
     from wlm.smoke.data import NumberedFiles

@@ -9,7 +9,7 @@ from rich.markup import escape
 
 from wlm.cli.console import check_output, note, note_warnings, quiet_warp, running, show, table
 from wlm.cli.options import Device, Engine, ShaderLanguage, output_option
-from wlm.cli.smoke_options import SHEET, Background, Lights, White, check_white, outputs, parse_lights, vector
+from wlm.cli.smoke_options import SHEET, Background, Lights, White, check_positive, outputs, parse_lights, vector
 from wlm.errors import WlmError
 
 if TYPE_CHECKING:
@@ -98,7 +98,7 @@ def shade(
     Without --light the lights of the scene are used, or else one from 1,1,1. With the default irradiance, 4 pi, a
     light along an axis shows the lightmap of this axis unchanged.
     """
-    check_white(white)
+    check_positive(white=white)
     lights, _ = parse_lights(light)
     behind = None if background is None else vector("--background", background)
     quiet_warp()
@@ -179,9 +179,7 @@ def flipbook(
     from wlm.smoke.flipbook.book import mip_padding, pack_book, write_book
 
     _, read = _source(lightmaps, textures, cells, source_layout, straight, from_gain, device)
-    for option, value in (("gain", gain), ("rate", rate)):
-        if value is not None and not 0 < value < float("inf"):
-            raise WlmError(f"--{option}: expected a number above 0, got {value}")
+    check_positive(gain=gain, rate=rate)
     with running("flipbook") as progress:
         shots = list(read(count, progress))
     padding = 0 if in_files else _PADDING
@@ -241,8 +239,7 @@ def _source(
         cells and not (int(rows) and int(columns))
     ):
         raise WlmError(f"--cells: expected rows and columns of 1 to 64, such as 8x8, got {cells}")
-    if gain is not None and not 0 < gain < float("inf"):
-        raise WlmError(f"--from-gain: expected a number above 0, got {gain}")
+    check_positive(from_gain=gain)
     size = {"rows": int(rows) or None, "columns": int(columns) or None}
     paths = (lightmaps, *(textures or ()))
     frames = read_flipbook(paths, layout, **size, straight=straight, gain=gain, notes=notes, device=device)

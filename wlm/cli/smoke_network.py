@@ -45,8 +45,7 @@ def train(
     The state is saved in NETWORK.partial from time to time and on Ctrl-C or SIGTERM; repeat the command with --resume
     to continue exactly. NETWORK.csv has the loss curves.
     """
-    console.check_output(output, ".safetensors")
-    console.quiet_warp()
+    console.begin(output, ".safetensors")
     from wlm.formats.checkpoint import SUFFIX
     from wlm.smoke import Profile
     from wlm.smoke.fit import train as fit
@@ -83,8 +82,7 @@ def export_onnx(
     ] = 512,
 ) -> None:
     """Write a network as ONNX: from encoded guiding maps to encoded lightmaps, of a fixed size, in float32."""
-    console.check_output(output, ".onnx")
-    console.quiet_warp()
+    console.begin(output, ".onnx")
     from wlm.smoke.codec import open_network, shipped
     from wlm.smoke.network import onnx_file
     from wlm.smoke.network.planes import GUIDES, PLANES
@@ -122,9 +120,7 @@ def evaluate(
     PSNR compares lightmaps in sRGB. Flicker is the change between frames that motion does not explain, relative to the
     reference's flicker.
     """
-    if json_path is not None:
-        console.check_output(json_path, ".json")
-    console.quiet_warp()
+    console.begin(json_path, ".json")
     from wlm.interop import check_device
     from wlm.smoke.codec import open_network
     from wlm.smoke.evaluation import evaluate

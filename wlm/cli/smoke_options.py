@@ -185,10 +185,11 @@ def parse_lights(
         raise WlmError(f"{option}: {error}") from error
 
 
-def check_white(white: float) -> None:
-    """Checks the value of `--white`, which must be above 0."""
-    if not 0 < white < float("inf"):
-        raise WlmError(f"--white: expected a number above 0, got {white}")
+def check_positive(**options: float | None) -> None:
+    """Checks values of options by name, which must be finite and above 0, or None."""
+    for name, value in options.items():
+        if value is not None and not 0 < value < float("inf"):
+            raise WlmError(f"--{name.replace('_', '-')}: expected a number above 0, got {value}")
 
 
 def outputs(smoke: Path, single: bool, output: Path, stem: str, suffix: str, *others: str) -> Callable[[int], Path]:

@@ -81,11 +81,8 @@ def functions(verb: str) -> dict[str, Callable[..., None]]:
 
 
 def variant(verb: str, system: str) -> Any:
-    """Builds the command that a verb runs for files of a system.
-
-    Raises:
-        WlmError: The system does not have the verb; the line names the alternative.
-    """
+    """Builds the command that a verb runs for files of a system. Raises a WlmError if the system does not have the
+    verb; the line names the alternative."""
     from wlm.cli.settings import command_of
 
     function = functions(verb).get(system)

@@ -8,7 +8,7 @@ import typer
 from rich.markup import escape
 
 from wlm.cli import options as opt
-from wlm.cli.console import check_output, quiet_warp, show, table
+from wlm.cli.console import begin, show, table
 from wlm.errors import WlmError
 
 _SLIDERS = ("hour", "sigma", "exposure", "error")
@@ -21,8 +21,7 @@ def view(
     key: opt.Key = None,
     time: opt.Time = None,
     view: Annotated[
-        str | None,
-        typer.Option(help="Picture to show: light or tiles of lightmaps; balls or gaussians of probes."),
+        str | None, typer.Option(help="Picture to show: light or tiles of lightmaps; balls or gaussians of probes.")
     ] = None,
     flat: Annotated[bool, typer.Option("--flat", help="Show a lightmap as a texture, not on its mesh.")] = False,
     sliders: Annotated[
@@ -48,9 +47,7 @@ def view(
     """Show compressed lightmaps or probes in a window; with --original, beside the original and the error."""
     pixels = _size(size)
     values = _values(sliders or ())
-    if screenshot is not None:
-        check_output(screenshot, ".png")
-    quiet_warp()
+    begin(screenshot, ".png")
     from wlm.formats.hdr_blocks import need
     from wlm.view.opening import open_scene
     from wlm.view.window import Window

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
-from wlm.cli.console import check_output, quiet_warp, running, show, table
+from wlm.cli.console import begin, running, show, table
 from wlm.cli.options import Key, Original, SceneFile, Time, Up, output_option
 from wlm.cli.smoke_options import Network, VolumeSettings, parse_volume
 from wlm.errors import WlmError
@@ -36,8 +36,7 @@ def web(
     up: Up = "y",
 ) -> None:
     """Write one HTML file that decodes and shows the light on the GPU of a browser. It works without a network."""
-    check_output(output, ".html")
-    quiet_warp()
+    begin(output, ".html")
     from wlm.export import write_page, write_viewer
 
     options = {"mesh": mesh, "original": original, "key": key, "time": time, "network": network}

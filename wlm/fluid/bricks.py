@@ -71,11 +71,7 @@ class BrickPool:
 
     def store(self, clear: bool = True) -> None:
         """Stores the listed bricks, in a larger pool if there are too many; waits until `relist` is done. With `clear`
-        no brick is busy then.
-
-        Raises:
-            WlmError: There is not enough memory.
-        """
+        no brick is busy then. Raises a WlmError if there is not enough memory."""
         if not self.is_full:
             if self._read is not None:
                 wp.synchronize_event(self._read)
@@ -83,11 +79,7 @@ class BrickPool:
         advection_sources.store(self.bricks, self.fields[0], clear)
 
     def reserve(self, count: int) -> None:
-        """Makes room for a number of bricks.
-
-        Raises:
-            WlmError: There is not enough memory.
-        """
+        """Makes room for a number of bricks. Raises a WlmError if there is not enough memory."""
         if count < self._size:
             return
         size = min(count + max(count // 4, _MARGIN), self.most) + 1

@@ -91,11 +91,8 @@ class Pieces(Sequence[bytes]):
     @overload
     def __getitem__(self, place: slice) -> list[bytes]: ...
     def __getitem__(self, place: int | slice) -> bytes | list[bytes]:
-        """Reads one piece, or several.
-
-        Raises:
-            ValueError: The file was closed, cut short or changed, or cannot be read.
-        """
+        """Reads one piece, or several. Raises a ValueError if the file was closed, cut short or changed, or cannot be
+        read."""
         if isinstance(place, slice):
             return [self[number] for number in range(*place.indices(len(self)))]
         data = self._file.read(int(self._starts[place]), int(self.sizes[place]))
@@ -148,12 +145,8 @@ def write_artifact(
     path: str | os.PathLike[str], system: str, settings: Mapping[str, Any], parts: Mapping[str, Content], source: str
 ) -> int:
     """Writes an artifact atomically and returns its size in bytes. Equal arguments give equal bytes; see
-    `encode_artifact`.
-
-    Raises:
-        ValueError: A name, a setting or a type that the format cannot store.
-        WlmError: The file cannot be written; the old content stays.
-    """
+    `encode_artifact`. Raises a ValueError for a name, a setting or a type that the format cannot store. Raises a
+    WlmError if the file cannot be written; the old content stays."""
     content = encode_artifact(system, settings, parts, source)
     try:
         return atomic_write(path, content)

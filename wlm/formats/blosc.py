@@ -14,23 +14,15 @@ _PADDED = 128  # OpenVDB pads shorter data to this number of bytes
 
 
 def unpacked_size(packed: bytes) -> int:
-    """Returns the decompressed size that the header states, in bytes.
-
-    Raises:
-        ValueError: The data is cut short.
-    """
+    """Returns the decompressed size that the header states, in bytes. Raises a ValueError if the data is cut short."""
     if len(packed) < _HEADER:
         raise ValueError(f"expected a Blosc header of {_HEADER} bytes, found {len(packed)}")
     return struct.unpack_from("<I", packed, 4)[0]
 
 
 def unpack(packed: bytes, size: int) -> bytes:
-    """Decompresses data of a known decompressed size.
-
-    Raises:
-        ValueError: The data is damaged or has another size.
-        WlmError: The package imagecodecs is missing.
-    """
+    """Decompresses data of a known decompressed size. Raises a ValueError if the data is damaged or has another size.
+    Raises a WlmError if the package imagecodecs is missing."""
     stated = unpacked_size(packed)
     if stated != size and not size < stated <= _PADDED:
         raise ValueError(f"expected a decompressed size of {size} bytes, found {stated}")

@@ -64,7 +64,8 @@ class Pace:
 class Checkpoint:
     """The state of one fit, in the file `OUTPUT.partial`; `resumed` tells whether it was read from there.
 
-    Batches are numbered from 0, and several may be unfinished at a time.
+    Batches are numbered from 0, and several may be unfinished at a time. `split` is the number of workers for which the
+    work was split into batches, which a resumed fit keeps; 0 if the fit has not set it.
     """
 
     def __init__(
@@ -95,7 +96,7 @@ class Checkpoint:
         """
         self.path = Path(f"{os.fspath(output)}{SUFFIX}")
         self.system = f"{system}-checkpoint"
-        self.resumed = False
+        self.resumed, self.split = False, 0
         self._source = source
         # The round trip through JSON makes the key comparable with a stored one: JSON has no tuples.
         self._key: dict[str, Any] = json.loads(json.dumps({**fit, "wlm": __version__}, allow_nan=False))
@@ -180,7 +181,7 @@ class Checkpoint:
         for number, state in self._running.items():
             tensors |= {f"{_RUNNING}.{number}.{key}": value for key, value in state.items()}
         with self._pace.saving():
-            write_artifact(self.path, self.system, {"fit": self._key}, tensors, self._source)
+            write_artifact(self.path, self.system, {"fit": self._key, "split": self.split}, tensors, self._source)
         self._unwritten = False
 
     def _read(self) -> None:
@@ -193,6 +194,9 @@ class Checkpoint:
                 f"{self.path}: the checkpoint is of another fit: {difference}; resume with the original inputs, or "
                 "start again without --resume"
             )
+        self.split = artifact.settings.get("split", 0)
+        if type(self.split) is not int or self.split < 0:
+            raise WlmError(f"{self.path}: split: expected an integer of at least 0, found {self.split!r:.60}")
         for name, value in artifact.tensors.items():
             state, number, key = (*name.split(".", 2), "", "")[:3]
             # At most nine digits: int() refuses very long numbers with its own message.

@@ -22,10 +22,7 @@ _WAIT = 120.0  # wall-clock limit in seconds
 
 def run_child(reader: ModuleType, data: bytes, *arguments: str) -> dict[str, np.ndarray]:
     """Runs the function `main` of a module on data and arguments in a limited process; returns its arrays by name.
-
-    Raises:
-        ValueError: The process raised an error, crashed or exceeded a limit, or could not be started.
-    """
+    Raises a ValueError if the process raised an error, crashed or exceeded a limit, or could not be started."""
     # With -P, a module beside the program cannot replace a package.
     command = [sys.executable, "-P", __file__, str(reader.__file__), *arguments]
     try:

@@ -48,10 +48,7 @@ def encode_compact(system: str, parts: Mapping[str, np.ndarray]) -> list[bytes |
 
 def parse_compact(where: object, mapped: bytes | memoryview) -> tuple[str, int, dict[str, np.ndarray], int]:
     """Splits the mapped content of a compact artifact and checks its digest; `where` names the file in messages.
-
-    Returns:
-        System, version, parts as views, and the number of bytes before them.
-    """
+    Returns the system, the version, parts as views, and the number of bytes before them."""
     view = np.frombuffer(mapped, np.uint8)
     begin = view[:4].tobytes()
     version, number = (begin[3] & 15, begin[3] >> 4) if len(begin) == 4 else (_VERSION, 0)

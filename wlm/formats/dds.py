@@ -116,12 +116,7 @@ def read_dds(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]]
     """Reads the largest mip of a DDS texture of light; returns float32 [H, W, 3 or 4] and the channel names."""
     with open_file(path, "the DDS file") as file:
         held = os.fstat(file.fileno()).st_size
-        head = file.read(_HEADER.size)
-        if not head.startswith(MAGIC):
-            raise WlmError(f"{path}: expected a DDS file, found other content")
-        if len(head) < _HEADER.size:
-            raise WlmError(f"{path}: the file is cut short: expected {_HEADER.size} bytes, found {len(head)}")
-        fields = _HEADER.unpack(head)
+        fields = _HEADER.unpack(texels.read_head(path, file, "DDS", MAGIC, _HEADER.size))
         height, width, pixel_flags, code, caps2 = *fields[3:5], *fields[9:11], fields[17]
         texels.check_fields(
             path,

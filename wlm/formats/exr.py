@@ -276,10 +276,7 @@ def write_planes(
 
 def read_planes(path: str | os.PathLike[str]) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Reads all channels of an EXR file of one part, over its display window, and the note that `write_planes` stored.
-
-    Returns:
-        The planes by name, float32 [H, W], NaN included; and the note of the header, empty if the file has none.
-    """
+    Returns the planes by name, float32 [H, W], NaN included; and the note of the header, empty if the file has none."""
     header, *others = check_header(path)
     if others:
         raise WlmError(f"{path}: expected an EXR file of one part, found {1 + len(others)}")

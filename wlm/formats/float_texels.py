@@ -112,6 +112,16 @@ def layout_of(
     return layouts[number]
 
 
+def read_head(path: str | os.PathLike[str], file: BinaryIO, kind: str, magic: bytes, size: int) -> bytes:
+    """Reads the first `size` bytes of an open file, which begins with `magic` if it is of the `kind`."""
+    head = file.read(size)
+    if not head.startswith(magic):
+        raise WlmError(f"{path}: expected a {kind} file, found other content")
+    if len(head) < size:
+        raise WlmError(f"{path}: the file is cut short: expected {size} bytes, found {len(head)}")
+    return head
+
+
 def read_part(path: str | os.PathLike[str], file: BinaryIO, start: int, size: int, part: str) -> bytes:
     """Reads `size` bytes of an open file from `start` on; `path` and `part` name the file and the part in messages."""
     held = os.fstat(file.fileno()).st_size

@@ -46,12 +46,9 @@ class Geometry:
 
 
 def read_geometry(path: str | os.PathLike[str], uv_set: int | None = None, *, with_uv: bool = True) -> Geometry:
-    """Reads a mesh from a `.glb`, `.gltf`, `.obj`, `.ply`, `.stl` or `.off` file.
-
-    Args:
-        uv_set: n of `TEXCOORD_n`, the lightmap's UVs; None takes 1 if any primitive has it, else 0.
-        with_uv: Whether UVs are needed: primitives without them are then left out.
-    """
+    """Reads a mesh from a `.glb`, `.gltf`, `.obj`, `.ply`, `.stl` or `.off` file. `uv_set` is n of `TEXCOORD_n`, the
+    lightmap's UVs; None takes 1 if any primitive has it, else 0. `with_uv` tells whether UVs are needed: primitives
+    without them are then left out."""
     path = Path(path)
     if path.suffix.lower() in SUFFIXES:
         mesh = read_mesh(path)

@@ -165,14 +165,6 @@ Arrays = tuple[str, np.ndarray, np.ndarray, np.ndarray]
 """A mesh that came from elsewhere: its name, positions [V, 3], triangles int [F, 3] and UVs [V, 2]."""
 
 
-def document_from_arrays(
-    position: np.ndarray, triangle: np.ndarray, uv: np.ndarray, name: str
-) -> tuple[GltfDocument, GltfPrimitive]:
-    """Makes a glTF document of one mesh from arrays as `Arrays` describes them; returns it with its only primitive."""
-    document, (primitive,) = document_from_meshes([(name, position, triangle, uv)], name)
-    return document, primitive
-
-
 def document_from_meshes(
     meshes: Sequence[Arrays], name: str, uv_set: int = 0
 ) -> tuple[GltfDocument, list[GltfPrimitive]]:
@@ -310,13 +302,8 @@ def vertex_colours(
     document: GltfDocument, primitives: Sequence[GltfPrimitive], textured: bool = False
 ) -> list[np.ndarray]:
     """Returns the base colours of vertices: `COLOR_0`, or white without it, times the factor of the material.
-
-    Args:
-        textured: Whether materials may have a texture, by which the caller multiplies the colours.
-
-    Returns:
-        For each primitive float32 [V, 3], linear, from 0 to 1.
-    """
+    `textured` tells whether materials may have a texture, by which the caller multiplies the colours. Returns for each
+    primitive float32 [V, 3], linear, from 0 to 1."""
     with reported(document.path):
         colours = []
         for each in primitives:
@@ -598,8 +585,7 @@ def _data_uri(where: str, uri: str) -> bytes:
 
 def texture_image(document: GltfDocument, number: object) -> int:
     """Returns the index of the image of a texture. Of several sources float pictures come first, then those that all
-    readers know.
-    """
+    readers know."""
     texture = document.item("textures", number)
     extensions = texture.get("extensions", {})
     for name in ("EXT_texture_exr", "", "EXT_texture_webp", "KHR_texture_basisu", "MSFT_texture_dds"):
@@ -624,8 +610,7 @@ def held_image(document: GltfDocument, number: int) -> bytes | memoryview | None
 
 def texture_transform(where: str, info: dict) -> tuple[int | None, np.ndarray]:
     """Returns how a texture slot reads UVs: n of its `TEXCOORD_n`, None if the slot does not state it; and its
-    KHR_texture_transform, float64 [2, 3]: UV' = transform[:, :2] UV + transform[:, 2].
-    """
+    KHR_texture_transform, float64 [2, 3]: UV' = transform[:, :2] UV + transform[:, 2]."""
     transform = info.get("extensions", {}).get("KHR_texture_transform", {})
     names = {"scale": [1.0, 1.0], "rotation": 0.0, "offset": [0.0, 0.0]}
     scale, turn, offset = (np.array(transform.get(name, usual), np.float64) for name, usual in names.items())

@@ -65,8 +65,7 @@ def write_glb(
     path: str | os.PathLike[str], document: GltfDocument, replacements: Sequence[Replacement], uv_set: int
 ) -> int:
     """Writes the result of `encode_glb` atomically and returns its size in bytes; also raises if the file can't be
-    written.
-    """
+    written."""
     return atomic_write(path, encode_glb(document, replacements, uv_set, path))
 
 

@@ -66,8 +66,7 @@ _DEEPEST = 32
 class GodotUser:
     """A mesh that uses a lightmap: path of its node with "/" between names; the rectangle x, y, width, height, by whose
     last two UV2 is scaled and by whose first two it is offset, v down; index of the slice, counted through all
-    textures.
-    """
+    textures."""
 
     node: str
     rectangle: tuple[float, float, float, float]
@@ -125,12 +124,8 @@ def read_lmbake(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def relit(path: str | os.PathLike[str], sh: np.ndarray) -> bytes:
-    """Replaces the coefficients [N, 9, 3] of the N probes of a bake, and returns the new content of the file.
-
-    Raises:
-        WlmError: See `read_lmbake`; or the bake is compressed.
-        ValueError: The shape is wrong.
-    """
+    """Replaces the coefficients [N, 9, 3] of the N probes of a bake, and returns the new content of the file. Raises a
+    WlmError as `read_lmbake` does, or if the bake is compressed. Raises a ValueError if the shape is wrong."""
     points, colours, reader, at = _read(path)
     if bytes(reader.data[:4]) != b"RSRC":
         raise WlmError(f"{path}: the bake is compressed; save it without compression to replace its light")

@@ -186,11 +186,8 @@ def is_volume(head: bytes) -> bool:
 
 
 def read_ktx2_volume(path: str | os.PathLike[str]) -> np.ndarray:
-    """Reads the largest mip of a 3D texture of light in its stored order, whatever `KTXorientation` states.
-
-    Returns:
-        The texels, float32 [D, H, W, 3]; alpha is left out.
-    """
+    """Reads the largest mip of a 3D texture of light in its stored order, whatever `KTXorientation` states. Returns the
+    texels, float32 [D, H, W, 3]; alpha is left out."""
     return _read(path, True, [])[0][..., :3]
 
 
@@ -198,12 +195,7 @@ def _read(path: str | os.PathLike[str], volume: bool, notes: list[str]) -> tuple
     """Returns the texels [D, H, W, C] as stored, their layout, and whether columns go right and rows go down."""
     with open_file(path, "the KTX2 file") as file:
         held = os.fstat(file.fileno()).st_size
-        head = file.read(_READ_HEADER.size)
-        if not head.startswith(MAGIC):
-            raise WlmError(f"{path}: expected a KTX2 file, found other content")
-        if len(head) < _READ_HEADER.size:
-            raise WlmError(f"{path}: the file is cut short: expected {_READ_HEADER.size} bytes, found {len(head)}")
-        fields = _READ_HEADER.unpack(head)
+        fields = _READ_HEADER.unpack(texels.read_head(path, file, "KTX2", MAGIC, _READ_HEADER.size))
         number, _, width, height, depth, layers, faces, _, scheme = fields[1:10]
         descriptor, pairs = fields[10:12], fields[12:14]
         start, stored, size = fields[16:19]

@@ -62,10 +62,7 @@ def temporary(target: Path, *, folder: bool = False) -> Iterator[Path]:
     """Yields the path of an empty file or folder beside its destination, and removes it at the end if it still exists.
 
     `target`, the destination, contains no links. The temporary name is short, since that of `target` may be very long.
-
-    Raises:
-        OSError: The file or folder cannot be made.
-    """
+    Raises an OSError if the file or folder cannot be made."""
     sweep(target)
     handle = None
     try:

@@ -16,20 +16,8 @@ from wlm.formats.limits import IMAGE_BYTES
 from wlm.formats.reading import damaged, read_file
 
 DAMAGED_PICTURE = (
-    OSError,
-    SyntaxError,
-    ValueError,
-    TypeError,
-    LookupError,
-    ArithmeticError,
-    RuntimeError,
-    AttributeError,
-    EOFError,
-    MemoryError,
-    NotImplementedError,
-    struct.error,
-    zlib.error,
-    Image.DecompressionBombError,
+    *(OSError, SyntaxError, ValueError, TypeError, LookupError, ArithmeticError, RuntimeError, AttributeError),
+    *(EOFError, MemoryError, struct.error, zlib.error, Image.DecompressionBombError),
 )
 """Exceptions that Pillow and imagecodecs raise for a damaged picture or other content."""
 

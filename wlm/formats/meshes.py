@@ -78,11 +78,8 @@ def read_mesh(path: str | os.PathLike[str]) -> MeshArrays:
 
 def _absolute(data: bytes) -> bytes:
     """Returns an OBJ with absolute numbers of vertices: trimesh counts relative ones back from the last vertex of the
-    file. A byte order mark and tabs, with which it overlooks lines, are left out.
-
-    Raises:
-        ValueError: A face names vertex 0, or one before the first.
-    """
+    file. A byte order mark and tabs, with which it overlooks lines, are left out. Raises a ValueError if a face names
+    vertex 0, or one before the first."""
     data = data.removeprefix(codecs.BOM_UTF8).replace(b"\\\r\n", b" ").replace(b"\\\n", b" ").replace(b"\t", b" ")
     if _ZERO.search(data):
         raise ValueError("expected vertices counted from 1, found 0")

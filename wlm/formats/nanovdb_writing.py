@@ -25,12 +25,9 @@ _TILE = np.dtype([("key", "<u8"), ("child", "<i8"), ("state", "<u4"), ("value", 
 
 
 def encode_nvdb(grids: Sequence[tuple[str, np.ndarray, np.ndarray]], codec: str) -> bytes:
-    """Returns the content of a file of grids of floats and vectors, each in a segment of its own.
-
-    Args:
-        grids: As for `wlm.formats.vdb_writing.encode_vdb`, with transforms that scale and shift; halves become floats.
-        codec: "zip": compressed by zlib; "none": grids as they are in memory.
-    """
+    """Returns the content of a file of grids of floats and vectors, each in a segment of its own. `grids` are as for
+    `wlm.formats.vdb_writing.encode_vdb`, with transforms that scale and shift; halves become floats. `codec` is "zip":
+    compressed by zlib; "none": grids as they are in memory."""
     parts, zipped = [], codec == "zip"
     for name, values, matrix in grids:
         kind, flags = ((_FLOAT, _FOG), _RANGES) if values.ndim == 3 else ((_VECTOR, 0), 0)

@@ -124,11 +124,8 @@ class OpenFile:
         self._file: _Handle | None = _Handle(os.dup(file.fileno()), "rb")
 
     def read(self, start: int, size: int) -> bytes:
-        """Reads `size` bytes from byte `start` on.
-
-        Raises:
-            ValueError: The file was closed or cut short, or cannot be read.
-        """
+        """Reads `size` bytes from byte `start` on. Raises a ValueError if the file was closed or cut short, or cannot
+        be read."""
         # With its own reference, so that `close` in another thread does not end it during the read.
         handle, data = self._file, b""
         if handle is None:

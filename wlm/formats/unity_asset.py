@@ -93,11 +93,8 @@ def _objects(data: bytes) -> list[tuple[str, bytes]]:
 
 
 def _probes(text: bytes) -> tuple[np.ndarray, np.ndarray]:
-    """Reads the positions, float64 [N, 3], and the coefficients, float64 [N, 9, 3], of a `LightProbes` object.
-
-    Raises:
-        ValueError: The lines are damaged or incomplete.
-    """
+    """Reads the positions, float64 [N, 3], and the coefficients, float64 [N, 9, 3], of a `LightProbes` object. Raises a
+    ValueError if the lines are damaged or incomplete."""
     places = (float(number) for match in _VECTOR.finditer(_member(text, _TEXT_POSITIONS)) for number in match.groups())
     position, light = np.fromiter(places, np.float64).reshape(-1, 3), _member(text, _TEXT_LIGHT)
     values = np.fromiter((float(match[2]) for match in _COEFFICIENT.finditer(light)), np.float64)

@@ -63,8 +63,7 @@ class GridHead:
 class VdbGrid:
     """A grid of a file: its name, and values float32 [X, Y, Z] over the bounding box of the active voxels, or voxel 0
     if none is active. `low` is the box's lowest voxel (x, y, z); `matrix`, float64 [4, 4], maps indices of voxel
-    centres to world space; `background` is the value of all voxels that are not stored.
-    """
+    centres to world space; `background` is the value of all voxels that are not stored."""
 
     name: str
     matrix: np.ndarray
@@ -359,11 +358,8 @@ class _Tree:
 
 
 def leaf_array(low: np.ndarray, high: np.ndarray, most: int, where: str) -> tuple[np.ndarray, np.ndarray]:
-    """Allocates the whole leaves around a box of voxels from `low` [3] up to but without `high` [3].
-
-    Returns:
-        Uninitialised values, float32 [X, Y, Z], and their first voxel [3].
-    """
+    """Allocates the whole leaves around a box of voxels from `low` [3] up to but without `high` [3]. Returns
+    uninitialised values, float32 [X, Y, Z], and their first voxel [3]."""
     first = low // LEAF * LEAF
     shape = -(-(high - first) // LEAF) * LEAF
     if not (low.min() >= -_FARTHEST and high.max() <= _FARTHEST and math.prod(shape.tolist()) <= most):

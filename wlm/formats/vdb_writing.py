@@ -16,12 +16,9 @@ _LIBRARY = (10, 0)  # the version of OpenVDB that states this version of the for
 
 
 def encode_vdb(grids: Sequence[tuple[str, np.ndarray, np.ndarray]]) -> bytes:
-    """Returns the content of a file of grids.
-
-    Args:
-        grids: For each its name; its values [X, Y, Z], or vectors [X, Y, Z, 3], stored as halves if they are float16
-            and as float32 otherwise; and its transform, [4, 4], from indices of voxel centres to world space.
-    """
+    """Returns the content of a file of grids. `grids` has for each its name; its values [X, Y, Z], or vectors [X, Y, Z,
+    3], stored as halves if they are float16 and as float32 otherwise; and its transform, [4, 4], from indices of voxel
+    centres to world space."""
     parts = [struct.pack("<2I", 0, len(grids))]
     size = 57 + len(parts[0])  # of what is before the next grid
     for name, values, matrix in grids:

@@ -33,11 +33,8 @@ def compress(*pieces: bytes) -> bytes:
 
 
 def check_frame(frame: bytes, size: int, name: str) -> None:
-    """Checks the size that a frame states, if it states one, without decompressing it; `name` is for messages.
-
-    Raises:
-        ValueError: The data are no frame, or one of another size.
-    """
+    """Checks the size that a frame states, if it states one, without decompressing it; `name` is for messages. Raises a
+    ValueError if the data are no frame, or one of another size."""
     try:
         stated = zstandard.frame_content_size(frame)
     except zstandard.ZstdError as error:
@@ -47,11 +44,8 @@ def check_frame(frame: bytes, size: int, name: str) -> None:
 
 
 def decompress(frame: bytes, size: int, name: str) -> bytes:
-    """Decompresses data of exactly one frame to `size` bytes, and never allocates more; `name` is for messages.
-
-    Raises:
-        ValueError: The frame is damaged or has another size.
-    """
+    """Decompresses data of exactly one frame to `size` bytes, and never allocates more; `name` is for messages. Raises
+    a ValueError if the frame is damaged or has another size."""
     check_frame(frame, size, name)
     try:
         reader = zstandard.ZstdDecompressor()
@@ -64,11 +58,8 @@ def decompress(frame: bytes, size: int, name: str) -> bytes:
 
 
 def inflate(data: bytes, size: int, name: str) -> bytes:
-    """Decompresses one zlib stream to `size` bytes, and allocates at most one byte more; `name` is for messages.
-
-    Raises:
-        ValueError: The stream is damaged or has another size.
-    """
+    """Decompresses one zlib stream to `size` bytes, and allocates at most one byte more; `name` is for messages. Raises
+    a ValueError if the stream is damaged or has another size."""
     reader = zlib.decompressobj()
     try:
         unpacked = reader.decompress(data, size + 1)
@@ -94,11 +85,8 @@ def pack_parts(parts: Mapping[str, np.ndarray]) -> tuple[dict[str, np.ndarray], 
 
 
 def unpack_parts(tensors: Mapping[str, np.ndarray], shapes: Shapes, table: Mapping[str, Part]) -> dict[str, np.ndarray]:
-    """Decompresses the parts that `pack_parts` compressed; `check_parts` still has to check their values.
-
-    Raises:
-        ValueError: A frame is damaged, a part is not in the table, or a shape needs more bytes than a frame can hold.
-    """
+    """Decompresses the parts that `pack_parts` compressed; `check_parts` still has to check their values. Raises a
+    ValueError if a frame is damaged, a part is not in the table, or a shape needs more bytes than a frame can hold."""
     result = dict(tensors)
     for name, shape in shapes.items():
         if name not in table or name not in tensors:

@@ -17,7 +17,7 @@ import numpy as np
 from wlm.atlas.listing import read_listing
 from wlm.atlas.materials import filled_slots, own_extension
 from wlm.config import check_settings, read_yaml
-from wlm.errors import WlmError
+from wlm.errors import WlmError, counted
 from wlm.formats.artifact import read_artifact
 from wlm.formats.checkpoint import SUFFIX as CHECKPOINT
 from wlm.formats.gltf import read_gltf
@@ -35,7 +35,6 @@ from wlm.formats.unity_asset import read_lighting_data
 from wlm.inspection.finding import UNREADABLE, Finding, command, compress_command
 from wlm.inspection.pictures import inspect_picture, picture_of, said
 from wlm.inspection.sets import inspect_set
-from wlm.lightmap.listing import count_of
 from wlm.system import load, system_of
 
 if TYPE_CHECKING:
@@ -70,10 +69,7 @@ _MOST_NAMES = 8  # names that one line lists
 
 def kind_of(path: Path) -> str:
     """Finds the kind of a file from its first bytes, its suffix, or the names inside it; reads no large part of it.
-
-    Returns:
-        A key of the table of kinds, "" if the kind is unknown.
-    """
+    Returns a key of the table of kinds, "" if the kind is unknown."""
     with open_file(path, "the file") as file:
         head = file.read(VOLUME_HEAD)
     if is_volume(head):
@@ -253,10 +249,9 @@ def _model(path: Path) -> Finding:
     if system == "probe" and not model.has_positions:
         return Finding(path, f"{what}, without positions", command("info", path))
     if system == "lightmap" and len(model.groups) > 1:
-        sizes = (
-            f"{name} {size:,} bytes at {count_of(times, 'time')}" for name, (times, size) in model.group_sizes().items()
-        )
-        what = f"{what}; {count_of(model.groups, 'light group')}: {', '.join(sizes)}"
+        groups = model.group_sizes()
+        sizes = (f"{name} {size:,} bytes at {counted(len(times), 'time')}" for name, (times, size) in groups.items())
+        what = f"{what}; {counted(len(groups), 'light group')}: {', '.join(sizes)}"
     return Finding(path, what, command("web", path, "-o", "PAGE.html"))
 
 
@@ -284,7 +279,7 @@ def _kind_of_json(path: Path) -> str:
 
 def _lights(path: Path) -> Finding:
     listing = read_listing(path)
-    lists = f"{count_of(listing.sheets, 'lightmap')} at {count_of(listing.states, 'state')}"
+    lists = f"{counted(len(listing.sheets), 'lightmap')} at {counted(len(listing.states), 'state')}"
     return Finding(path, f"a list of lightmaps of a scene: {lists}; compress it together with its mesh")
 
 
@@ -292,7 +287,7 @@ def _positions(path: Path) -> Finding:
     from wlm.probe.data import load_positions
 
     use = "for --positions of wlm decode"
-    return Finding(path, f"{count_of(load_positions(path), 'position')} without light, {use}")
+    return Finding(path, f"{counted(len(load_positions(path)), 'position')} without light, {use}")
 
 
 def _settings(path: Path) -> Finding:
@@ -302,7 +297,7 @@ def _settings(path: Path) -> Finding:
         from wlm.smoke.scene import Scene
 
         scene = check_settings(Scene, values, f"{path}: ")
-        what = f"a scene of smoke: {count_of(range(scene.frames), 'frame')} at {scene.rate:g} a second"
+        what = f"a scene of smoke: {counted(scene.frames, 'frame')} at {scene.rate:g} a second"
         return Finding(path, what, command("smoke", "simulate", path, "-o", "DIR"))
     if "geometry" in values:
         return _bake_scene(path)
@@ -327,7 +322,7 @@ def _bake_scene(path: Path) -> Finding:
     from wlm.bake.work import open_task
 
     task = open_task(path)
-    what = f"a scene to bake at {count_of(task.scene.hours, 'hour')}, {task.geometry.name}"
+    what = f"a scene to bake at {counted(len(task.scene.hours), 'hour')}, {task.geometry.name}"
     use, problems = ("lightmaps", path, "-o", "DIR"), list[str]()
     geometry, settings = read_geometry(task.geometry, None), task.scene.lightmap
     check_lamps(path, task.scene, geometry)
@@ -346,13 +341,13 @@ def _scene(path: Path) -> Finding:
     from wlm.scene import load as load_scene
 
     with load_scene(path) as scene:
-        parts = [f"{len(scene.mesh.triangle):,} triangles", count_of(scene.light.groups, "light group")]
+        parts = [f"{len(scene.mesh.triangle):,} triangles", counted(len(scene.light.groups), "light group")]
         if scene.probes is not None:
-            parts.append(f"probes of {count_of(scene.probe_hours, 'hour')}")
+            parts.append(f"probes of {counted(len(scene.probe_hours), 'hour')}")
         if scene.moving:
-            parts.append(count_of(scene.moving, "moving object"))
+            parts.append(counted(len(scene.moving), "moving object"))
         if scene.smoke:
-            parts.append(f"smoke at {count_of(scene.smoke, 'place')}")
+            parts.append(f"smoke at {counted(len(scene.smoke), 'place')}")
         what = f"a scene over {scene.day.seconds:g} s, from {scene.day.first:g} h to {scene.day.last:g} h: "
     return Finding(path, what + ", ".join(parts), command("run", path, "-o", "DIR"))
 

@@ -8,7 +8,7 @@ from itertools import islice
 from pathlib import Path
 
 from wlm.atlas.listing import tiles_of
-from wlm.errors import WlmError
+from wlm.errors import WlmError, counted
 from wlm.formats.folder import read_index
 from wlm.formats.gltf import read_gltf
 from wlm.formats.godot import read_users
@@ -28,7 +28,7 @@ from wlm.inspection.files import (
 from wlm.inspection.finding import UNREADABLE, Finding, command, compress_command
 from wlm.inspection.pictures import Picture, is_half, picture_of, said, size_of
 from wlm.inspection.sets import UNREADABLE_SET, assumed, inspect_set, named, together
-from wlm.lightmap.listing import SET_FILE, count_of, list_set, natural, state_folders
+from wlm.lightmap.listing import SET_FILE, list_set, natural, state_folders
 from wlm.lightmap.sheet import BASE
 
 MOST = 256
@@ -223,8 +223,8 @@ def _unity(folder: Path, files: Sequence[Path]) -> _Found:
     problems += assumed(listing)
     names = ", ".join(layer.name for layer in listing.layers)
     size = " and ".join(dict.fromkeys(sizes))
-    maps = f"{count_of(listing.atlases, 'map')} of {size}, with {names}"
-    what = f"{count_of(states, 'state')} of light from Unity, {maps}"
+    maps = f"{counted(len(listing.atlases), 'map')} of {size}, with {names}"
+    what = f"{counted(len(states), 'state')} of light from Unity, {maps}"
     finding = Finding(folder, what, words, tuple(problems))
     its = {path for paths in held.values() for path in paths}
     if states == [folder]:
@@ -313,7 +313,7 @@ def _pictures(folder: Path, files: Sequence[Path]) -> _Found:
             alike = False
         if not alike:
             return []  # each is described by itself
-        what = f"six-way lightmaps of smoke, {count_of(smoke, 'frame')} of {heads[smoke[0]].size}"
+        what = f"six-way lightmaps of smoke, {counted(len(smoke), 'frame')} of {heads[smoke[0]].size}"
         return [(Finding(folder, what, command("smoke", "flipbook", folder, "-o", "OUT.png")), set(smoke))]
     if (folder / SET_FILE).is_file():
         return []  # it lists the lightmaps of the folder; others are described by themselves
@@ -334,7 +334,7 @@ def _pictures(folder: Path, files: Sequence[Path]) -> _Found:
         return [_of_mesh(folder, what, mesh, pictures)]
     if len(pictures) < 2:
         return []
-    what, words, problems = count_of(pictures, "lightmap"), "", list[str]()
+    what, words, problems = counted(len(pictures), "lightmap"), "", list[str]()
     try:
         problems, size = together(pictures, [heads[file] for file in pictures])
         if not size:
@@ -369,7 +369,7 @@ def _of_mesh(
 def _lightmaps_of(mesh: Path | None, pictures: Sequence[Path]) -> str:
     """Describes lightmaps that are named by UDIM tiles, or after the meshes of a file, in words; "" for others."""
     if tiles := tiles_of([file.stem for file in pictures]):
-        return f"{count_of(pictures, 'lightmap')} of the UDIM tiles {', '.join(map(str, tiles[:8]))}"
+        return f"{counted(len(pictures), 'lightmap')} of the UDIM tiles {', '.join(map(str, tiles[:8]))}"
     if mesh is None or len(pictures) < 2:
         return ""
     # This imports torch.
@@ -377,7 +377,7 @@ def _lightmaps_of(mesh: Path | None, pictures: Sequence[Path]) -> str:
 
     with suppress(WlmError):  # described by itself
         if all_by_name([file.name for file in pictures], read_gltf(mesh)[1]):
-            return f"{count_of(pictures, 'lightmap')} named after the meshes of {mesh.name}"
+            return f"{counted(len(pictures), 'lightmap')} named after the meshes of {mesh.name}"
     return ""
 
 

@@ -31,8 +31,7 @@ _HALF = "by its name half of a flip book of six-way lightmaps of smoke, without 
 class Picture:
     """Facts from the header of a picture: its kind, "EXR", "Radiance", "PFM", "TIFF", "KTX2" or "DDS", or one that is
     no light without an encoding, "PNG", "JPEG", "WebP" or "TGA"; and its size in texels and the names of its channels,
-    0 and empty if the beginning of the file does not state them.
-    """
+    0 and empty if the beginning of the file does not state them."""
 
     kind: str
     width: int = 0

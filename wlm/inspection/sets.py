@@ -3,13 +3,13 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from wlm.errors import WlmError
+from wlm.errors import WlmError, counted
 from wlm.formats.light import noted
 from wlm.inspection.finding import Finding, compress_command
 from wlm.inspection.pictures import Picture, picture_of, read_lit, said, size_of
 from wlm.lightmap.assumptions import set_lines, size_line
 from wlm.lightmap.layout import PICTURES, odd_layout, spread
-from wlm.lightmap.listing import Listing, count_of, list_set
+from wlm.lightmap.listing import Listing, list_set
 from wlm.lightmap.sheet import BASE, LIGHT
 
 UNREADABLE_SET = "a lightmap set that cannot be read"
@@ -25,17 +25,17 @@ def inspect_set(path: Path) -> Finding:
         masks = [mask for atlas in atlases if (mask := Path(str(atlas.mask))).suffix]  # the others are words
         if missing := [file.name for file in (*files, *masks) if not file.is_file()]:
             lost = f"{missing[0]} is missing" + f", and {len(missing) - 1} more" * (len(missing) > 1)
-            return Finding(folder, f"a set of {count_of(files, 'lightmap')}", problems=(lost,))
+            return Finding(folder, f"a set of {counted(len(files), 'lightmap')}", problems=(lost,))
         if [*listings] != [BASE]:
-            names = ", ".join(f"{name} at {count_of(own.states, 'time')}" for name, own in listings.items())
-            what = f"a set of lightmaps in {count_of(listings, 'light group')}: {names}; {size_of(files[0])}"
+            names = ", ".join(f"{name} at {counted(len(own.states), 'time')}" for name, own in listings.items())
+            what = f"a set of lightmaps in {counted(len(listings), 'light group')}: {names}; {size_of(files[0])}"
             problems = [f"{name}: {line}" for name, own in listings.items() for line in assumed(own)]
             return Finding(folder, what, compress_command(folder), tuple(problems))
         listing = listings[BASE]
-        what, problems = f"a set of lightmaps at {count_of(listing.states, 'time')}", list[str]()
+        what, problems = f"a set of lightmaps at {counted(len(listing.states), 'time')}", list[str]()
         if any(key != (LIGHT.atlas, LIGHT.layer) for key in listing.states[0]):
             names = ", ".join(layer.name for layer in listing.layers)
-            what = f"{what}: {count_of(listing.atlases, 'atlas')} with {names}"
+            what = f"{what}: {counted(len(listing.atlases), 'atlas', 'atlases')} with {names}"
         else:
             stored = listing.layers[0].stored
             what = f"{what}, {size_of(files[0])}" + (f", stored as {stored}" if stored else "")
@@ -73,10 +73,8 @@ def assumed(listing: Listing) -> list[str]:
 
 def together(files: Sequence[Path], heads: Sequence[Picture | None]) -> tuple[list[str], str]:
     """Checks whether pictures are one lightmap at several times, from all headers and the texels of at most eight.
-
-    Returns:
-        The problems, one line each, and the common size, such as "512x256"; "" if the pictures are not one lightmap.
-    """
+    Returns the problems, one line each, and the common size, such as "512x256"; "" if the pictures are not one
+    lightmap."""
     for file, head in zip(files, heads, strict=True):
         if head is None or not head.is_light:
             raise WlmError(f"{file.name}: expected a picture of light, found a file of another kind")

@@ -18,11 +18,7 @@ _NAMED = 8  # names that a line lists
 
 def set_lines(listing: Listing, period: float | None = None) -> Iterator[str]:
     """Yields one line for each assumption about the times and the states of a set, without the name of the set.
-
-    Args:
-        listing: The set.
-        period: The length of the day that the caller gives; None uses the set's.
-    """
+    `listing` is the set. `period` is the length of the day that the caller gives; None uses the set's."""
     times, period = listing.times, listing.period if period is None else period
     if len(times) > 1 and listing.origin:
         pairs = [f"{label} = {time:.6g}" for label, time in zip(listing.labels, times, strict=True)]

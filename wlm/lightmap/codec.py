@@ -59,10 +59,7 @@ class _Header(Header):
 
 def encode(model: LightmapModel) -> tuple[dict[str, Any], dict[str, Content], str]:
     """Converts a model to the content of its file. Tiles of a file that were not read stay in it, and are copied later.
-
-    Returns:
-        The settings, the parts by name, and the hash of the input that the model was made from.
-    """
+    Returns the settings, the parts by name, and the hash of the input that the model was made from."""
     headers: list[dict[str, Any]] = []
     parts: dict[str, Content] = {}
     masks, groups = set(), set[str]()
@@ -95,10 +92,7 @@ def encode(model: LightmapModel) -> tuple[dict[str, Any], dict[str, Content], st
 
 def decode(artifact: Artifact) -> LightmapModel:
     """Makes a model from the parts of its file, without its packed tiles, which the model reads when they are used.
-
-    Raises:
-        WlmError, ValueError: A setting or a part is missing or wrong, or they do not fit each other.
-    """
+    Raises a WlmError or ValueError if a setting or a part is missing or wrong, or they do not fit each other."""
     if "tiles" not in artifact.settings:
         raise ValueError("setting tiles: missing, as in files of an earlier version: compress the input again")
     header = check_settings(_Header, artifact.settings, "setting ")

@@ -34,7 +34,7 @@ from pathlib import Path
 
 import numpy as np
 
-from wlm.errors import WlmError
+from wlm.errors import WlmError, counted
 from wlm.formats.limits import TIMES
 from wlm.formats.mask import read_mask
 from wlm.formats.scratch import room
@@ -44,17 +44,7 @@ from wlm.lightmap.layout import odd_layout
 from wlm.lightmap.listing import Listing, list_set
 from wlm.lightmap.profile import TimeAxis
 from wlm.lightmap.reading import ALL, FROM_ALPHA, Bounds, Reader, Stack, size_text
-from wlm.lightmap.sheet import (
-    BASE,
-    LIGHT,
-    MOST_NAME,
-    VALUE_RANGES,
-    Sheet,
-    check_sheets,
-    is_group,
-    is_name,
-    sheets_of,
-)
+from wlm.lightmap.sheet import BASE, LIGHT, MOST_NAME, VALUE_RANGES, Sheet, check_sheets, is_group, is_name, sheets_of
 from wlm.texels import repair
 
 _PIECE = 1 << 18  # frames times texels that are filled at once
@@ -458,14 +448,9 @@ def at_times(times: np.ndarray, wanted: np.ndarray) -> np.ndarray:
 def parse_times(text: str) -> list[float]:
     """Reads a list of times: numbers and `start:stop:step` ranges, separated by commas.
 
-    A range leaves `stop` out, as in Python: "0:24:1" is 0, 1, ... 23, one day without its first hour twice.
-
-    Args:
-        text: Such as "0,1,2.5", "0:24:1" or "0:18:1,18.45,18.55,19:24:1".
-
-    Returns:
-        The times in the order written, at least one.
-    """
+    A range leaves `stop` out, as in Python: "0:24:1" is 0, 1, ... 23, one day without its first hour twice. `text` is a
+    list such as "0,1,2.5", "0:24:1" or "0:18:1,18.45,18.55,19:24:1". Returns the times in the order written, at least
+    one."""
     times: list[float] = []
     for part in text.split(","):
         try:
@@ -606,7 +591,7 @@ def _clamp(sheet: Sheet, labels: Sequence[str], frames: np.ndarray, mask: np.nda
         with np.errstate(invalid="ignore"):
             beyond = np.count_nonzero(((frame < 0.0) | (frame > 1.0)).any(axis=2) & inside)
         if beyond:
-            texels = f"{beyond} {'texel' if beyond == 1 else 'texels'}"
+            texels = counted(beyond, "texel")
             yield f"{labels[i]}: {sheet.label}: {texels} beyond {least:g} to {greatest:g}: clamped to it"
         np.clip(frame, 0.0, 1.0, out=frame)
 

@@ -51,12 +51,7 @@ class SheetDecoder:
         device: The device, as `wlm.interop.check_device` returns it.
     """
 
-    def __init__(
-        self,
-        model: SheetModel,
-        device: str = "cpu",
-        tiles: Sequence[int] | np.ndarray | None = None,
-    ) -> None:
+    def __init__(self, model: SheetModel, device: str = "cpu", tiles: Sequence[int] | np.ndarray | None = None) -> None:
         """Uploads a sheet, or only the tiles of some numbers, which alone are read of a sheet of a file."""
         self.device, gelu = device_of(device), model.profile.gelu
         self.model = model if tiles is None else model.only(tiles)
@@ -88,8 +83,7 @@ class SheetDecoder:
 
     def frame(self, time: float) -> np.ndarray:
         """Decodes the map, float32 [H, W, 3]: radiance, or values in [0, 1] if it isn't light; 0 in empty tiles and in
-        tiles that were not uploaded.
-        """
+        tiles that were not uploaded."""
         image = np.zeros((self._grid.height, self._grid.width, 3), np.float32)
         for numbers in self._stored():
             place(image, self.tiles(numbers.tolist(), time), numbers, self._grid)

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from wlm import system
+from wlm import interop, system
 from wlm.errors import WlmError
 from wlm.lightmap.data import LightmapSet, SheetFrames
 from wlm.lightmap.decode import SheetDecoder
@@ -24,6 +24,7 @@ from wlm.lightmap.tiles import TILE, TileKind
 from wlm.lightmap.view_scores import VIEWS, ShownScore, Tally, views_of
 from wlm.metrics import BRIGHTER, METRICS, FrameMetrics, LostLight, Summary, evaluate_frame, summarise
 from wlm.system import Meter, OnProgress
+from wlm.workers import each
 
 SCORES = (*METRICS, "seen")
 """Scores that `evaluate` can compute: the metrics of the paper's protocol, and those of `wlm.lightmap.view_scores`."""
@@ -33,7 +34,7 @@ MEANS = ("psnr", "ssim", "flip", "seen", "ring", "between", "border", "flicker")
 
 _LOST = "texel", "their tile"
 _FEW_TEXELS = 16  # of the 16,384 texels of a tile
-_TILES_AT_ONCE = 256  # 48 MiB of decoded light
+_TILES_AT_ONCE = 64  # 12 MiB of decoded light in each thread
 
 
 @dataclass(frozen=True)
@@ -242,16 +243,33 @@ def lost_light(model: LightmapModel, lightmaps: LightmapSet, device: str = "cpu"
 
 
 def _lost_light(model: SheetModel, lightmaps: SheetFrames, device: str) -> list[str]:
-    mask, lost, decoder = scored_mask(model, lightmaps), LostLight(), None
-    for i, (frame, stamp) in enumerate(zip(lightmaps.frames, model.times, strict=True)):
-        inside, light = mask & lightmaps.valid(i), np.maximum(np.maximum(frame[..., 0], frame[..., 1]), frame[..., 2])
-        doubtful = [each for each in _windows(model) if _may_hide_loss(light[each[1]][inside[each[1]]])]
-        for start in range(0, len(doubtful), _TILES_AT_ONCE):
-            decoder, some = decoder or SheetDecoder(model, device), doubtful[start : start + _TILES_AT_ONCE]
+    mask, lost, times = scored_mask(model, lightmaps), LostLight(), range(len(model.times))
+
+    def doubtful(i: int) -> list[tuple[int, tuple[slice, slice]]]:
+        inside, frame = mask & lightmaps.valid(i), lightmaps.frames[i]
+        light = np.maximum(np.maximum(frame[..., 0], frame[..., 1]), frame[..., 2])
+        return [at for at in _windows(model) if _may_hide_loss(light[at[1]][inside[at[1]]])]
+
+    chosen = list(each(doubtful, times))
+    if not any(chosen):
+        return []
+    decoder = SheetDecoder(model, device)
+    # Loads the kernel of each kind of tile: threads must not do it at once.
+    decoder.tiles(np.unique(model.kind, return_index=True)[1], model.times[0])
+
+    def look(i: int) -> LostLight:
+        own, frame, inside, stamp = LostLight(), lightmaps.frames[i], mask & lightmaps.valid(i), model.times[i]
+        for start in range(0, len(chosen[i]), _TILES_AT_ONCE):
+            some = chosen[i][start : start + _TILES_AT_ONCE]
             for (tile, window), decoded in zip(some, decoder.tiles([tile for tile, _ in some], stamp), strict=True):
                 valid = inside[window]
                 inner = decoded[: valid.shape[0], : valid.shape[1]][valid]
-                lost.add(frame[window][valid], inner, _place(tile, stamp))
+                own.add(frame[window][valid], inner, _place(tile, stamp))
+        return own
+
+    with interop.one_thread():
+        for own in each(look, times):
+            lost.merge(own)
     return lost.warnings(model.name, *_LOST)
 
 

@@ -1,5 +1,6 @@
 """Fits a compressed model to a lightmap set (neural-dynamic-gi, sections 3.4 and 4)."""
 
+import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -25,7 +26,7 @@ from wlm.workers import cores, each
 from wlm_kernels.lightmap.matrix_step import WIDTHS
 
 BATCH_TEXELS = 64 * 26 * TILE * TILE
-"""Number of texels, counted at each time, in a batch: 64 tiles at 26 times, 330 MB of training data."""
+"""Largest number of texels, counted at each time, in a batch: 64 tiles at 26 times, 330 MB of training data."""
 
 CPU_TILES = 4
 """Largest number of tiles in a batch on a CPU: two cores gain nothing from more, and many cores want many batches."""
@@ -94,9 +95,15 @@ def compress(
     if tiles is not None and len(lightmaps.sheets) > 1:
         raise WlmError(f"{lightmaps.name}: tiles: expected a set with one sheet, found {len(lightmaps.sheets)}")
     fits = {sheet: SheetFit(own, profile.for_sheet(sheet), tiles, progress) for sheet, own in lightmaps.sheets.items()}
+    # Several GPUs get equal work; a resumed fit has the batches that it began with.
+    split = (checkpoint and checkpoint.split) or (len(set(place.devices())) if cluster is None else workers or 1)
+    if checkpoint is not None:
+        checkpoint.split = split
+    whole = sum(fit.whole_batches for fit in fits.values())
+    share = whole / (split * max(1, math.ceil(whole / split)))
     batches: list[Batch] = []
     for fit in fits.values():
-        batches += fit.batches(len(batches), CPU_TILES if device == "cpu" else None)
+        batches += fit.batches(len(batches), share, CPU_TILES if device == "cpu" else None)
     sheets = {sheet: fit.model for sheet, fit in fits.items()}
     if place == Place():
         samples = profile.steps * profile.samples * sum(len(batch.rows) for batch in batches)
@@ -233,11 +240,21 @@ class SheetFit:
             if meter.due(i + 1):
                 meter.report(i + 1)
 
-    def batches(self, first: int, most: int | None = None) -> list[Batch]:
-        """Splits the tiles into batches of 1 to `most` tiles, about `BATCH_TEXELS` each, numbered from `first`."""
-        size = max(1, BATCH_TEXELS // (len(self.model.times) * TILE * TILE))
-        size = size if most is None else min(size, most)
-        rows = range(len(self._dynamic))
+    @property
+    def _largest(self) -> int:
+        return max(1, BATCH_TEXELS // (len(self.model.times) * TILE * TILE))
+
+    @property
+    def whole_batches(self) -> float:
+        """How many of the largest batches the dynamic tiles are."""
+        return len(self._dynamic) / self._largest
+
+    def batches(self, first: int, share: float = 1.0, most: int | None = None) -> list[Batch]:
+        """Splits the dynamic tiles into batches, numbered from `first`: equal ones of about a share of the largest
+        batch, or if it is given of `most` tiles."""
+        rows, size = range(len(self._dynamic)), min(most or self._largest, self._largest)
+        if rows and most is None:
+            size = math.ceil(len(rows) / math.ceil(len(rows) / math.ceil(share * size)))
         starts = enumerate(rows[::size], first)
         return [Batch(number, rows[start : start + size], self) for number, start in starts]
 

@@ -5,7 +5,7 @@ of atlases and layers; the plain set of one lightmap for each time has one atlas
 """
 
 import re
-from collections.abc import Mapping, Sequence, Sized
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -15,7 +15,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validat
 from pydantic_core import PydanticCustomError
 
 from wlm.config import check_settings
-from wlm.errors import WlmError
+from wlm.errors import WlmError, counted
 from wlm.formats.hours import DAY, hours_of_names
 from wlm.formats.levels import SUFFIXES as LEVEL_SUFFIXES
 from wlm.formats.light import EXPECTED, SUFFIXES
@@ -36,14 +36,8 @@ _GIVEN = "the times given, in the order of the names"
 
 @dataclass(frozen=True)
 class Source:
-    """A picture: a whole file, or one of several pictures of equal height that are stacked vertically in a file.
-
-    Attributes:
-        path: The file.
-        label: Name of the picture in warnings.
-        slice: Index of the picture in the stack, from the top.
-        slices: Number of pictures in the stack.
-    """
+    """A picture: the file `path`, or number `slice`, from the top, of `slices` pictures of equal height that are
+    stacked in it. `label` is its name in warnings."""
 
     path: Path
     label: str
@@ -53,14 +47,10 @@ class Source:
 
 @dataclass(frozen=True)
 class LayerInfo:
-    """A layer, which every atlas of the set has.
-
-    Attributes:
-        encoding: "radiance", "unit" for values in [0, 1], or "signed" for values in [-1, 1].
-        channels: Channels to read; None reads R, G and B of radiance and all channels of other layers.
-        stored: How the files of a layer of radiance store their light, if they don't define it themselves: an encoding
-            of `wlm.formats.channels`. None: they do.
-    """
+    """A layer, which every atlas of the set has. Its encoding is "radiance", "unit" for values in [0, 1], or "signed"
+    for values in [-1, 1]. `channels` are those to read; None reads R, G and B of radiance and all channels of other
+    layers. `stored` is the encoding of `wlm.formats.channels` in which files store radiance, None if they define it
+    themselves."""
 
     name: str
     encoding: str
@@ -129,11 +119,8 @@ def list_set(
     stored: str | None = None,
     groups: Mapping[str, Path] | None = None,
 ) -> dict[str, Listing]:
-    """Lists the files of a set, by the rules that `wlm.lightmap.load` describes. `stored` is its `encoding`.
-
-    Returns:
-        A listing for each light group; for a set that names none, one of the name `BASE`.
-    """
+    """Lists the files of a set, by the rules that `wlm.lightmap.load` describes. `stored` is its `encoding`. Returns a
+    listing for each light group; for a set that names none, one of the name `BASE`."""
     found = _listings(path, times, layers, trust, stored is not None)
     for name, own in (groups or {}).items():
         if not is_group(name) or name in found:
@@ -205,11 +192,6 @@ def natural(name: str) -> list[str | int]:
     return [int(part) if i % 2 else part.lower() for i, part in enumerate(re.split(r"([0-9]+)", name))]
 
 
-def count_of(items: Sized, noun: str) -> str:
-    """Returns the number of items in words: "1 time", "2 times"."""
-    return f"{len(items)} {noun}{'' if len(items) == 1 else 's'}"
-
-
 def state_folders(folder: Path) -> list[Path]:
     """Returns the folders that hold lightmaps with Unity's names: the folder itself, or folders in it in natural order.
 
@@ -228,7 +210,9 @@ def state_folders(folder: Path) -> list[Path]:
 
 def _check_count(where: Path, items: Sequence[object], times: Sequence[float], noun: str) -> None:
     if len(times) != len(items):
-        raise WlmError(f"{where}: {count_of(times, 'time')} for {count_of(items, noun)}; expected a time for each")
+        raise WlmError(
+            f"{where}: {counted(len(times), 'time')} for {counted(len(items), noun)}; expected a time for each"
+        )
 
 
 def _timed(folder: Path, stems: Sequence[str], times: Sequence[float] | None, noun: str) -> dict[str, Any]:
@@ -240,8 +224,8 @@ def _timed(folder: Path, stems: Sequence[str], times: Sequence[float] | None, no
     if None in hours:
         order = ", ".join(stems[:8]) + ", ..." * (len(stems) > 8)
         raise WlmError(
-            f"{folder}: {count_of(stems, noun)} and no {SET_FILE}: give {count_of(stems, 'time')} with --times, in the "
-            f"order {order} ({stems[hours.index(None)]} does not end in an hour such as _18h)"
+            f"{folder}: {counted(len(stems), noun)} and no {SET_FILE}: give {counted(len(stems), 'time')} with "
+            f"--times, in the order {order} ({stems[hours.index(None)]} does not end in an hour such as _18h)"
         )
     a_day = len(hours) > 1 and all(0 <= hour < DAY for hour in hours)
     return {"times": hours, "period": DAY if a_day else None, "origin": "hours from the names", "doubt": doubt}

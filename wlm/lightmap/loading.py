@@ -61,8 +61,7 @@ class TileLoader:
     def request(self, sheet: Sheet, number: int, priority: float = 0.0) -> bool:
         """Asks for a tile, or changes the priority of a tile that waits: higher ones come first, equal ones in the
         order of their requests. Returns False if the request was dropped, since `most` requests wait that are at least
-        as important.
-        """
+        as important."""
         self._check(sheet, number)
         with self._change:
             self._check_open()
@@ -81,8 +80,7 @@ class TileLoader:
 
     def replace(self, requests: Iterable[tuple[Sheet, int, float]]) -> None:
         """Drops all waiting requests and asks for other tiles: sheet, number and priority of each. Of more than `most`
-        the first ones count.
-        """
+        the first ones count."""
         asked = list(islice(requests, self._most))
         for sheet, number, _ in asked:
             self._check(sheet, number)
@@ -121,11 +119,8 @@ class TileLoader:
             return taken
 
     def wait(self, seconds: float | None = None) -> bool:
-        """Waits until a result can be taken, or nothing waits any more, at most some seconds.
-
-        Returns:
-            Whether a result can be taken.
-        """
+        """Waits until a result can be taken, or nothing waits any more, at most some seconds. Returns whether a result
+        can be taken."""
         with self._change:
             self._change.wait_for(lambda: self._results or not (self._waiting or self._current), seconds)
             return bool(self._results)

@@ -179,11 +179,8 @@ class SheetModel:
         return None if "_tiles" not in vars(self) or "uv" in vars(self) else vars(self)["_tiles"].pieces
 
     def only(self, numbers: Sequence[int] | np.ndarray) -> "SheetModel":
-        """Returns the sheet with some of its tiles; the others are empty. Of a file only these are read.
-
-        Args:
-            numbers: Numbers of the tiles in the grid, in any order; empty tiles stay empty.
-        """
+        """Returns the sheet with some of its tiles; the others are empty. Of a file only these are read. `numbers` are
+        the numbers of the tiles in the grid, in any order; empty tiles stay empty."""
         # In this order, since another thread may read all tiles meanwhile.
         stored = None if self.pieces is None else vars(self)["_tiles"]
         chosen, part = np.asarray(numbers, np.int64).reshape(-1), copy(self)

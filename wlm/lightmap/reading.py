@@ -35,8 +35,7 @@ def size_text(shape: Sequence[int]) -> str:
 class Stack:
     """The pictures of a layer of an atlas at T times: `frames`, float32 [T, H, W, 3] by sheet, are levels; `alpha`,
     bool [T, H, W], is true where alpha is above 0, and None if the mask is not from alpha; `present`, bool [T], marks
-    the times that have a picture; `warnings` are lines about the pictures.
-    """
+    the times that have a picture; `warnings` are lines about the pictures."""
 
     frames: dict[Sheet, np.ndarray]
     alpha: np.ndarray | None

@@ -145,11 +145,7 @@ def layer_sheets(where: str, sheets: Iterable[Sheet], layer: str | None, atlas: 
 
 def check_sheets(where: str, sizes: Mapping[Sheet, tuple[int, int]]) -> None:
     """Checks the number and the sizes of the sheets that a set or a file claims to have, before memory is allocated.
-
-    Args:
-        where: The set or the file, for messages.
-        sizes: Height and width of each sheet.
-    """
+    `where` names the set or the file in messages; `sizes` has the height and width of each sheet."""
     if not 1 <= len(sizes) <= MOST_SHEETS:
         raise WlmError(f"{where}: expected 1 to {MOST_SHEETS} sheets of three channels, found {len(sizes)}")
     channels: dict[tuple[str, str], list[tuple[str, str]]] = {}

@@ -33,11 +33,7 @@ class PackedMask:
     frame: bytes | None
 
     def check(self) -> None:
-        """Checks that the frame states the right size.
-
-        Raises:
-            ValueError: It does not.
-        """
+        """Checks that the frame states the right size. Raises a ValueError if it does not."""
         if self.frame is not None:
             zstd.check_frame(self.frame, -(-math.prod(self.shape) // 8), "part mask")
 
@@ -69,11 +65,8 @@ class StoredTiles:
     mask: PackedMask
 
     def read(self, sheet: SheetModel) -> dict[str, np.ndarray]:
-        """Reads and unpacks the tiles of a sheet, which may have some of the file's tiles.
-
-        Returns:
-            The arrays in `PACKED`, by name.
-        """
+        """Reads and unpacks the tiles of a sheet, which may have some of the file's tiles. Returns the arrays in
+        `PACKED`, by name."""
         table, filled = part_table(sheet.profile, sheet.kind, len(sheet.times)), copy(sheet)
         arrays = {name: np.zeros(table[name].shape, table[name].dtype) for name in PACKED}
         vars(filled).update(arrays)

@@ -158,10 +158,10 @@ class Trainer:
         shapes |= {"uvt_endpoints": (n * slices, r // 4, r // 4, 2, 4), "uvt_weights": (n * slices, r, r)}
         shapes |= {"ut": plane, "vt": plane}
         self._cuda = device != "cpu"
-        self._kernels = lightmap_step.step_kernels(profile.hidden, profile.gelu, "cuda" if self._cuda else "cpu")
         self._pool = None if self._cuda else ThreadPoolExecutor(CPU_LANES)
-        if not self._cuda:
-            # Two lanes that launch them at once would compile them twice into one file.
+        # Two threads that launch kernels at once would compile them twice into one file.
+        with interop.alone:
+            self._kernels = lightmap_step.step_kernels(profile.hidden, profile.gelu, "cuda" if self._cuda else "cpu")
             self._kernels.load(device)
             wp.load_module(gather, device)
         with interop.stream(device):
@@ -169,9 +169,14 @@ class Trainer:
             self._upload(targets, seed, profile.gamma, slices)
             self.batch.schedule = self._rates_over_steps(profile.final_rate)
             self._draw(seed)
-        self._repeated = [
-            interop.LaunchGraph(partial(self._step, stage, _REPEATS), device, warmup=1) for stage in range(3)
-        ]
+        repeated = (partial(self._step, stage, _REPEATS) for stage in range(3))
+        self._repeated = [interop.LaunchGraph(steps, device, warmup=1) for steps in repeated]
+        with interop.alone, interop.stream(device):
+            self._round()  # loads the kernels of later stages, too
+            if self._integers:
+                levels.put_on_levels(*self._levels_args)
+            for graph in self._repeated:
+                graph.capture()
 
     def _allocate(self, shapes: dict[str, tuple[int, ...]], hidden: int) -> None:
         """Allocates maps of these shapes, networks of a hidden width, and all arrays that a training step writes."""
@@ -314,26 +319,20 @@ class Trainer:
 
     def run(self, steps: int) -> None:
         """Runs the given number of training steps; on a GPU it only queues them."""
-        step, threads = self.step, torch.get_num_threads()
-        end = step + steps
-        try:
-            if not self._cuda:
-                # A second thread of torch would spin between its calls, on the core that a lane needs.
-                torch.set_num_threads(1)
-            with interop.stream(self.device):
-                first_quantised = max(step, self._quantised_from)
-                while step < end:
-                    stage, last = self.stage(step), step + _REPEATS
-                    if step == first_quantised:
-                        self._round()  # each step of quantised maps does it for the next one
-                    if self._cuda and last <= end and self.stage(last - 1) == stage:
-                        self._repeated[stage]()
-                        step = last
-                    else:
-                        self._step(stage)
-                        step += 1
-        finally:
-            torch.set_num_threads(threads)
+        step = self.step
+        end, first_quantised = step + steps, max(step, self._quantised_from)
+        # A second thread of torch would spin between its calls, on the core that a lane needs.
+        with interop.one_thread(self.device), interop.stream(self.device):
+            while step < end:
+                stage, last = self.stage(step), step + _REPEATS
+                if step == first_quantised:
+                    self._round()  # each step of quantised maps does it for the next one
+                if self._cuda and last <= end and self.stage(last - 1) == stage:
+                    self._repeated[stage]()
+                    step = last
+                else:
+                    self._step(stage)
+                    step += 1
 
     def _step(self, stage: int, count: int = 1) -> None:
         for _ in range(count):
@@ -342,8 +341,9 @@ class Trainer:
 
     def _round(self) -> None:
         """Puts endpoints and weights on the levels of the file, for steps of quantised maps."""
-        for pair in (("uv_endpoints", "uv_weights"), ("uvt_endpoints", "uvt_weights")):
-            blocks.round_to_levels(*(getattr(each, name) for each in (self._maps, self._rounded) for name in pair))
+        with interop.alone:
+            for pair in (("uv_endpoints", "uv_weights"), ("uvt_endpoints", "uvt_weights")):
+                blocks.round_to_levels(*(getattr(each, name) for each in (self._maps, self._rounded) for name in pair))
 
     def _add_gradients(self, stage: int) -> None:
         quantised = stage > 0
@@ -385,7 +385,7 @@ class Trainer:
         nets = self.hidden, self.output
         if self._integers:
             nets = self._on_levels
-            with interop.stream(self.device):
+            with interop.alone, interop.stream(self.device):
                 levels.put_on_levels(*self._levels_args)
         net = torch.cat([values.flatten(1) for values in nets], 1)
         uvt = self._blocks("uvt")
@@ -399,7 +399,7 @@ class Trainer:
     def _blocks(self, name: str) -> np.ndarray:
         """Returns a map as BC7 blocks, uint8 [S, H/4, W/4, 16]: S images of H x W texels, one per tile or slice."""
         endpoints, weights = (getattr(self._maps, f"{name}_{part}") for part in ("endpoints", "weights"))
-        with interop.stream(self.device):
+        with interop.alone, interop.stream(self.device):
             levels = wp.empty(endpoints.shape, dtype=wp.vec4ub, device=self.device)
             index = wp.empty(weights.shape, dtype=wp.uint8, device=self.device)
             blocks.quantise(endpoints, weights, levels, index)
@@ -450,7 +450,8 @@ class Trainer:
                 moments.copy_(values[key])
 
     def close(self) -> None:
-        """Ends the trainer's threads."""
+        """Ends the trainer's threads and frees its graphs, which hold references to it."""
+        self._repeated = []
         if self._pool is not None:
             self._pool.shutdown()
 
@@ -458,17 +459,19 @@ class Trainer:
 class Fitter:
     """Fits batches of tiles one after another, in this process or in another one (`wlm.dispatch`)."""
 
+    threads = True
+
     def __init__(self, device: str, seed: int, track: bool) -> None:
         """Takes settings for all batches: the device, the seed, and whether to report the PSNR (`track`)."""
         self._seed, self._track, self._device = seed, track, interop.check_device(device)
+        with interop.stream(self._device):
+            pass  # creates the device's context and stream, which threads must not do at once
         self._trainer: Trainer | None = None
 
     def start(self, job: TileJob, states: list[dict[str, np.ndarray] | None]) -> Advance:
         """Starts a batch, or continues it from its saved state; raises ValueError if it is another batch's."""
         self.close()
         self._trainer = Trainer(job.profile, job.axis, job.targets(), self._seed, self._device, self._track)
-        # All kernels of a batch are compiled before its first steps are reported.
-        wp.load_module(blocks, self._device)
         if states[0] is not None:
             self._trainer.load(states[0])
         return Advance(self._trainer.step)

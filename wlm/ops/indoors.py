@@ -47,8 +47,7 @@ class Indoors:
     def views(self, count: int, seed: int = 0) -> list[Viewpoint]:
         """Creates `count` views from the eye positions in turn, with directions spread evenly around the horizon and
         slightly up and down; none if there is no eye position. `seed` selects a rotation of all directions and the
-        first eye position.
-        """
+        first eye position."""
         if not len(self.eye):
             return []
         turn, start = np.random.default_rng((seed, 1)).random(2)

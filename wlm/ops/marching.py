@@ -116,18 +116,8 @@ class _March(torch.autograd.Function):
         count = torch.empty(rays, dtype=torch.int32, device=device)
         with on_stream(device):
             single_scatter.depths(to_warp(density), to_warp(toward, wp.vec3), step, to_warp(nodes))
-            single_scatter.march(
-                to_warp(density),
-                optional_array(emission, 3, wp.vec3, device),
-                to_warp(nodes),
-                to_warp(origin, wp.vec3),
-                to_warp(direction, wp.vec3),
-                step,
-                to_warp(scattered),
-                to_warp(emitted, wp.vec3),
-                to_warp(depth),
-                to_warp(count),
-            )
+            results = to_warp(scattered), to_warp(emitted, wp.vec3), to_warp(depth), to_warp(count)
+            single_scatter.march(*_arrays(density, emission, nodes, origin, direction), step, *results)
         ctx.save_for_backward(density, emission, toward, origin, direction, nodes, depth, count)
         ctx.step = step
         return scattered, emitted, depth
@@ -139,19 +129,9 @@ class _March(torch.autograd.Function):
         device, needed = density.device, ctx.needs_input_grad
         on_density = on_emission = on_origin = on_direction = None
         with on_stream(device):
-            arguments = [
-                to_warp(density),
-                optional_array(emission, 3, wp.vec3, device),
-                to_warp(nodes),
-                to_warp(origin, wp.vec3),
-                to_warp(direction, wp.vec3),
-                ctx.step,
-                to_warp(depth),
-                to_warp(count),
-                to_warp(grad_scattered),
-                to_warp(dense(grad_emitted), wp.vec3),
-                to_warp(grad_depth),
-            ]
+            arrays = _arrays(density, emission, nodes, origin, direction)
+            grads = to_warp(grad_scattered), to_warp(dense(grad_emitted), wp.vec3), to_warp(grad_depth)
+            arguments = [*arrays, ctx.step, to_warp(depth), to_warp(count), *grads]
             if needed[0] or needed[1]:
                 on_density, on_nodes = zeros_for(density), zeros_for(nodes)
                 on_emission = zeros_for(emission) if needed[1] else None
@@ -164,6 +144,13 @@ class _March(torch.autograd.Function):
                 rays = to_warp(on_origin, wp.vec3), to_warp(on_direction, wp.vec3)
                 single_scatter.march_backward(*arguments, rays=rays)
         return on_density, on_emission, None, on_origin, on_direction, None
+
+
+def _arrays(
+    density: torch.Tensor, emission: torch.Tensor | None, nodes: torch.Tensor, *rays: torch.Tensor
+) -> list[wp.array]:
+    glow = optional_array(emission, 3, wp.vec3, density.device)
+    return [to_warp(density), glow, to_warp(nodes), *(to_warp(each, wp.vec3) for each in rays)]
 
 
 def _henyey_greenstein(g: float, cosine: torch.Tensor) -> torch.Tensor:

@@ -8,18 +8,15 @@ from typing import Any
 import torch
 import warp as wp
 
-from wlm.interop import to_warp, warp_stream
+from wlm.interop import launch_on, to_warp, warp_stream
 
 Shape = tuple[int | EllipsisType | None, ...]
 """Sizes of a tensor's axes; None allows any size, and a leading `...` any number of axes."""
 
 
 def check(name: str, tensor: torch.Tensor, shape: Shape, device: torch.device | None = None) -> None:
-    """Checks that a tensor is float32 and has the given shape and device; None allows any device of Warp.
-
-    Raises:
-        ValueError: It isn't a dense torch tensor, its shape, type or device doesn't fit, or torch.func is active.
-    """
+    """Checks that a tensor is float32 and has the given shape and device; None allows any device of Warp. Raises a
+    ValueError if it isn't a dense torch tensor, its shape, type or device doesn't fit, or torch.func is active."""
     _check_tensor(name, tensor, "float32", shape)
     if tensor.dtype != torch.float32 or not _fits(tensor, shape):
         hint = ": use its float()" if tensor.is_floating_point() and tensor.dtype != torch.float32 else ""
@@ -28,11 +25,8 @@ def check(name: str, tensor: torch.Tensor, shape: Shape, device: torch.device | 
 
 
 def check_index(name: str, index: torch.Tensor, count: int, shape: Shape, device: torch.device) -> None:
-    """Checks a tensor of indices from 0 to `count` - 1; values are not checked while a CUDA graph is captured.
-
-    Raises:
-        ValueError: As for `check`, or a number doesn't fit.
-    """
+    """Checks a tensor of indices from 0 to `count` - 1; values are not checked while a CUDA graph is captured. Raises a
+    ValueError as `check` does, or if a number doesn't fit."""
     _check_tensor(name, index, "int32 or int64", shape)
     if index.dtype not in (torch.int32, torch.int64) or not _fits(index, shape):
         raise ValueError(f"{name}: expected int32 or int64 {_text(shape)}, got {index.dtype} {tuple(index.shape)}")
@@ -47,11 +41,8 @@ def check_finite(ranges: dict[str, tuple[float, float]] | None = None, **tensors
     """Checks that tensors of one device contain finite numbers, within `ranges` by name; the check waits for the GPU
     once.
 
-    None and empty tensors are skipped, and so is the whole check while a CUDA graph is captured.
-
-    Raises:
-        ValueError: A number isn't finite or in range.
-    """
+    None and empty tensors are skipped, and so is the whole check while a CUDA graph is captured. Raises a ValueError if
+    a number isn't finite or in range."""
     present = {name: tensor.detach() for name, tensor in tensors.items() if tensor is not None and tensor.numel()}
     if not present or any(_capturing(tensor) for tensor in present.values()):
         return
@@ -72,7 +63,7 @@ def on_stream(device: torch.device) -> AbstractContextManager:
     wp.init()
     if device.type == "cpu":
         return nullcontext()
-    return wp.ScopedStream(warp_stream(torch.cuda.current_stream(device)), sync_enter=False)
+    return launch_on(warp_stream(torch.cuda.current_stream(device)))
 
 
 def dense(tensor: torch.Tensor) -> torch.Tensor:

@@ -10,11 +10,8 @@ FORM = "three of x, y, z, each once, a mirrored one with a minus sign, such as x
 
 
 def read_axes(text: str | None) -> np.ndarray:
-    """Returns a change of axes as a matrix, float64 [3, 3], with new = matrix @ old; None: no change.
-
-    Raises:
-        WlmError: The text is not of the form `FORM`.
-    """
+    """Returns a change of axes as a matrix, float64 [3, 3], with new = matrix @ old; None: no change. Raises a WlmError
+    if the text is not of the form `FORM`."""
     names = "x,y,z" if text is None else text.replace(" ", "")
     parts = names.split(",")
     if sorted(part.removeprefix("-") for part in parts) != ["x", "y", "z"]:
@@ -26,18 +23,10 @@ def read_axes(text: str | None) -> np.ndarray:
 
 
 def turned(values: np.ndarray, matrix: np.ndarray) -> np.ndarray:
-    """Returns the light of probes in other axes.
-
-    Args:
-        values: [N, D], canonical spherical harmonics in RGB (`wlm.probe.conventions`).
-        matrix: [3, 3], orthogonal: new = matrix @ old.
-
-    Returns:
-        [N, D] of the type of `values`; with exact zeros and signs where coefficients are exchanged or mirrored.
-
-    Raises:
-        WlmError: The numbers are not spherical harmonics in RGB, and the axes change.
-    """
+    """Returns the light of probes in other axes. `values` are [N, D], canonical spherical harmonics in RGB
+    (`wlm.probe.conventions`). `matrix` is [3, 3], orthogonal: new = matrix @ old. The result is [N, D] of the type of
+    `values`; with exact zeros and signs where coefficients are exchanged or mirrored. Raises a WlmError if the numbers
+    are not spherical harmonics in RGB, and the axes change."""
     if (matrix == np.eye(3)).all():
         return values
     coefficients = sh_count(values.shape[1])

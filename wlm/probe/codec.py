@@ -73,11 +73,8 @@ class _NameHeader(Header):
 
 def encode(model: ProbeModel) -> tuple[dict[str, Any], dict[str, Stored], str]:
     """Encodes a model for `wlm.formats.artifact`: its settings, arrays and pieces, and the hash of the input; for a
-    model without regions no settings, one array of bytes, and an empty hash.
-
-    Raises:
-        ValueError: The model's Gaussians have not been quantised to integers.
-    """
+    model without regions no settings, one array of bytes, and an empty hash. Raises a ValueError if the model's
+    Gaussians have not been quantised to integers."""
     body = np.frombuffer(pack(model), np.uint8)
     if isinstance(model.content, Regions):
         return {"name": model.name}, {BODY: body, _REGIONS: model.content.packed}, model.source[:_SOURCE]
@@ -111,11 +108,8 @@ def pack(model: ProbeModel) -> bytes:
 
 def decode(artifact: Artifact) -> ProbeModel:
     """Restores the model that `encode` stored, bit for bit, except that the input's hash keeps only 8 of 16 digits.
-    Regions are not read.
-
-    Raises:
-        WlmError, ValueError: A setting or an array is missing or wrong, or they contradict each other.
-    """
+    Regions are not read. Raises a WlmError or ValueError if a setting or an array is missing or wrong, or they
+    contradict each other."""
     name = check_settings(_NameHeader, artifact.settings, "setting ").name
     return unpack(artifact.tensors[BODY].tobytes(), name, artifact.pieces.get(_REGIONS))
 

@@ -47,19 +47,10 @@ _COSINE = np.array([cosine_factor(band) / math.pi for band in coefficient_bands(
 
 
 def to_canonical(values: np.ndarray, name: str) -> np.ndarray:
-    """Converts an engine's coefficients to canonical ones.
-
-    Args:
-        values: [N, C, 3], C = 1, 4, 9 ... coefficients, RGB last. NaN and Inf are kept.
-        name: One of `CONVENTIONS`.
-
-    Returns:
-        float64 [N, C, 3]; `from_canonical` inverts it, without any rounding for "threejs" and "unreal".
-
-    Raises:
-        WlmError: The name is unknown, C is not the square of a number of bands, or the engine has fewer bands.
-        ValueError: The shape is different.
-    """
+    """Converts an engine's coefficients to canonical ones. `values` are [N, C, 3], C = 1, 4, 9 ... coefficients, RGB
+    last. NaN and Inf are kept. `name` is one of `CONVENTIONS`. Returns float64 [N, C, 3]; `from_canonical` inverts it,
+    without any rounding for "threejs" and "unreal". Raises a WlmError if the name is unknown, C is not the square of a
+    number of bands, or the engine has fewer bands. Raises a ValueError if the shape is different."""
     return _checked(values) / _factors(values.shape[1], name)[:, None]
 
 

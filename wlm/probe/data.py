@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from wlm.errors import WlmError
+from wlm.errors import WlmError, counted
 from wlm.formats.atomic import atomic_path, atomic_write
 from wlm.formats.folder import rounded
 from wlm.formats.godot import read_lmbake
@@ -27,12 +27,7 @@ from wlm.formats.scratch import room
 from wlm.formats.unity_asset import read_lighting_data
 from wlm.probe.ambient_cube import READING, read_irradiance_volume
 from wlm.probe.axes import read_axes, turned
-from wlm.probe.conventions import (
-    CANONICAL,
-    CONVENTIONS,
-    from_canonical,
-    to_canonical,
-)
+from wlm.probe.conventions import CANONICAL, CONVENTIONS, from_canonical, to_canonical
 from wlm.probe.fields import read_fields, read_positions, read_table
 from wlm.probe.hours import hour_factors, listed_times
 from wlm.probe.layouts import COEFFICIENT, ORDERS, choose_order, coefficients_first, described
@@ -504,11 +499,13 @@ def _check(where: str, name: str, raw: _Raw, convention: str | None, order: str 
     broken = np.flatnonzero(~finite)
     if len(broken):
         warnings.append(
-            f"{name}: {_probes(len(broken))} with a NaN or infinite number in {key}, first probe {broken[0]}: "
+            f"{name}: {counted(len(broken), 'probe')} with a NaN or infinite number in {key}, first probe {broken[0]}: "
             "set to zero and left out"
         )
     if repeated := _repeated(position):
-        warnings.append(f"{name}: {_probes(repeated)} at the position of another: Gaussians decode them to one value")
+        warnings.append(
+            f"{name}: {counted(repeated, 'probe')} at the position of another: Gaussians decode them to one value"
+        )
     source = _hash(position, checked, live, raw.times)
     return ProbeSet(name, position, checked, key, live, source, tuple(warnings), normal, reading, raw.times)
 
@@ -545,10 +542,6 @@ def _repeated(position: np.ndarray) -> int:
         return 0
     ordered = position[np.lexsort(position.T)]
     return int((ordered[1:] == ordered[:-1]).all(axis=1).sum())
-
-
-def _probes(count: int) -> str:
-    return f"{count} {'probe' if count == 1 else 'probes'}"
 
 
 def _hash(position: np.ndarray, values: np.ndarray, live: np.ndarray, times: np.ndarray) -> str:

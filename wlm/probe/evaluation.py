@@ -156,10 +156,7 @@ def at_hour(time: float | None) -> str:
 def _evaluate(decoder: Decoder, probes: ProbeSet, file_bytes: int) -> Report:
     """Compares the light that a decoder has at its present time with that of one hour."""
     decoded = decoder.decode_probes()
-    return replace(
-        score(decoded, probes, file_bytes),
-        between_psnr=between_psnr(decoder, probes),
-    )
+    return replace(score(decoded, probes, file_bytes), between_psnr=between_psnr(decoder, probes))
 
 
 def score(decoded: np.ndarray, probes: ProbeSet, file_bytes: int) -> Report:

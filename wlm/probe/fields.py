@@ -36,14 +36,10 @@ _LONGEST_LINE = 1 << 20  # characters
 
 
 class Fields(NamedTuple):
-    """The fields of probes in a JSON file.
-
-    Attributes:
-        names: The names of the fields; the position and the light have the names "position" and "sh".
-        read: Reads a field as an array. Raises WlmError if it is missing or not numeric.
-        convention: The SH convention that the file states or that follows from its kind, "" if unknown.
-        axes: A remark on the axes of the positions, "" if there is none.
-    """
+    """The fields of probes in a JSON file. The position and the light have the `names` "position" and "sh". `read`
+    reads a field as an array; it raises a WlmError if the field is missing or not numeric. `convention` is the SH
+    convention that the file states or that follows from its kind, `axes` a remark on the axes of the positions; both
+    are "" if unknown."""
 
     names: list[str]
     read: Callable[[str], np.ndarray]
@@ -68,11 +64,8 @@ def holds_probes(content: Any) -> bool:
 
 
 def read_positions(path: Path) -> np.ndarray:
-    """Reads the positions of probes, or a list of points, from a JSON file as an array.
-
-    Raises:
-        WlmError: The file cannot be read or its content has another form.
-    """
+    """Reads the positions of probes, or a list of points, from a JSON file as an array. Raises a WlmError if the file
+    cannot be read or its content has another form."""
     content = read_json_file(path, "the probes", JSON_BYTES)
     if isinstance(content, list) and _list_of_probes(content) is None:
         return _numbers(path, _POSITION, content)
@@ -80,11 +73,8 @@ def read_positions(path: Path) -> np.ndarray:
 
 
 def read_fields(path: Path) -> Fields:
-    """Finds the fields of the probes in a JSON file.
-
-    Raises:
-        WlmError: The file cannot be read or its content has another form.
-    """
+    """Finds the fields of the probes in a JSON file. Raises a WlmError if the file cannot be read or its content has
+    another form."""
     content = read_json_file(path, "the probes", JSON_BYTES)
     fields = _fields(path, content)
     stated = content.get(_CONVENTION, fields.convention) if isinstance(content, dict) else fields.convention
@@ -171,10 +161,7 @@ def _axes(names: list[str]) -> list[str]:
 
 def _light(names: list[str]) -> tuple[list[str], bool]:
     """Finds names with consecutive numbers (`sh0`, `sh[ 1]`), or one such series per colour channel (`shr0`, `c0_g`).
-
-    Returns:
-        The names in order, and whether they go channel by channel; no names if they do not form a full set.
-    """
+    Returns the names in order, and whether they go channel by channel; no names if they do not form a full set."""
     found = {}
     for name in names:
         if match := _NUMBERED.fullmatch(_plain(name)):
@@ -240,11 +227,8 @@ def _rows(path: Path, holder: dict, field: str) -> list:
 
 
 def _numbers(path: Path, field: str, rows: list) -> np.ndarray:
-    """Converts nested lists of one shape to an array; booleans are allowed only in the fields `_FLAGS`.
-
-    Raises:
-        WlmError: The lists have several shapes, or an element is not a number.
-    """
+    """Converts nested lists of one shape to an array; booleans are allowed only in the fields `_FLAGS`. Raises a
+    WlmError if the lists have several shapes, or an element is not a number."""
     kinds = "biuf" if field in _FLAGS else "iuf"
     array = _array(rows, kinds)
     if array is None and any(isinstance(row, dict | list) for row in rows[:1]):

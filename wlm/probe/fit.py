@@ -29,11 +29,7 @@ from wlm.system import Meter, OnProgress
 _MOST_LATENT, _MOST_HIDDEN = 32, 128  # of a fit of several hours
 _AT_ONCE = {"cpu": 1, "cuda": 4}  # regions trained together: one alone leaves parts of a GPU idle
 _BATCHES = 1_000_000  # numbers in the checkpoint for the regions of a fit; those below are of fits without regions
-_FINISHED = {
-    "packed": Part(np.uint8, (None,)),
-    "box": Part(np.float64, (7,)),
-    "count": Part(np.int32, (2,), least=0),
-}
+_FINISHED = {"packed": Part(np.uint8, (None,)), "box": Part(np.float64, (7,)), "count": Part(np.int32, (2,), least=0)}
 
 
 def open_checkpoint(

@@ -115,21 +115,15 @@ class Content(ABC):
 
     @abstractmethod
     def parts(self) -> dict[str, np.ndarray]:
-        """Returns the arrays that a file stores, by name.
-
-        Raises:
-            ValueError: The numbers have not been quantised for a file.
-        """
+        """Returns the arrays that a file stores, by name. Raises a ValueError if the numbers have not been quantised
+        for a file."""
 
     @classmethod
     @abstractmethod
     def table(cls, profile: Profile, outputs: int, hours: int, count: int, live: int, clusters: int) -> dict[str, Part]:
         """Returns the types and shapes of these arrays, by name, for `count` Gaussians, or components of each of
-        `clusters`; `live` probes; and `outputs` numbers of a probe at each hour.
-
-        Raises:
-            ValueError: There are more components than numbers of a probe.
-        """
+        `clusters`; `live` probes; and `outputs` numbers of a probe at each hour. Raises a ValueError if there are more
+        components than numbers of a probe."""
 
     @classmethod
     @abstractmethod
@@ -137,10 +131,7 @@ class Content(ABC):
         cls, profile: Profile, outputs: int, hours: int, stored: Mapping[str, np.ndarray], dropped: int
     ) -> Self:
         """Builds the content from a file's arrays, whose types and shapes have been checked; `outputs` as for `table`.
-
-        Raises:
-            ValueError: The numbers contradict each other, or exceed what a decoder can compute in float32.
-        """
+        Raises a ValueError if the numbers contradict each other, or exceed what a decoder can compute in float32."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -267,18 +258,8 @@ def box_of(position: np.ndarray) -> dict[str, Any]:
 
 
 def check_points(position: np.ndarray) -> np.ndarray:
-    """Checks points in space and returns them as float64.
-
-    Args:
-        position: [M, 3].
-
-    Returns:
-        float64 [M, 3].
-
-    Raises:
-        WlmError: A position is not finite.
-        ValueError: The shape is different.
-    """
+    """Checks points in space, [M, 3], and returns them as float64. Raises a WlmError if a position is not finite.
+    Raises a ValueError if the shape is different."""
     position = np.asarray(position, np.float64)
     if position.ndim != 2 or position.shape[1] != 3:
         raise ValueError(f"position: expected [M, 3], got {position.shape}")

@@ -17,14 +17,9 @@ _SHARE = 0.45  # radius of a ball over the median distance between neighbours, s
 
 
 class Known(NamedTuple):
-    """Positions of a model's probes, and their original light if the input was given.
-
-    Attributes:
-        position: float64 [N, 3].
-        values: float32 [N, D], the input of the fit; None if it was not given.
-        live: bool [N], false for dead probes.
-        normal: float64 [N, 3], as in `wlm.probe.ProbeSet`; None if unknown.
-    """
+    """The positions of a model's probes, float64 [N, 3], and their original light, float32 [N, D], None if the input
+    was not given. `live`, bool [N], is false for dead probes; `normal`, float64 [N, 3] or None, is that of
+    `wlm.probe.ProbeSet`."""
 
     position: np.ndarray
     values: np.ndarray | None
@@ -61,11 +56,8 @@ def probes_of(
 
 
 def positions_of(model: ProbeModel, original: str | os.PathLike[str] | None) -> np.ndarray | None:
-    """Reads the positions of a model's probes from another file, float64 [N, 3]; None if no file is given.
-
-    Raises:
-        WlmError: The file cannot be read or has other probes.
-    """
+    """Reads the positions of a model's probes from another file, float64 [N, 3]; None if no file is given. Raises a
+    WlmError if the file cannot be read or has other probes."""
     if original is None:
         return None
     position = load_positions(original)

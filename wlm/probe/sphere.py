@@ -25,11 +25,8 @@ def ambient_numbers(outputs: int) -> int:
 
 
 def coefficient_bands(coefficients: int) -> np.ndarray:
-    """Returns the band l of each coefficient, int64 [C]: 0, 1, 1, 1, 2, ...
-
-    Raises:
-        ValueError: C is not the square of a positive number.
-    """
+    """Returns the band l of each coefficient, int64 [C]: 0, 1, 1, 1, 2, ... Raises a ValueError if C is not the square
+    of a positive number."""
     if coefficients < 1 or math.isqrt(coefficients) ** 2 != coefficients:
         raise ValueError(f"coefficients: expected whole bands (1, 4, 9, 16, ...), got {coefficients}")
     order = np.arange(math.isqrt(coefficients))
@@ -93,17 +90,9 @@ def basis(directions: np.ndarray, coefficients: int) -> np.ndarray:
 
 def irradiance(values: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """Returns the irradiance of surfaces at a probe; divided by pi, it is the radiance of a white diffuse surface.
-
-    Args:
-        values: [..., C, 3], SH coefficients of radiance.
-        normals: [M, 3], of unit length.
-
-    Returns:
-        float64 [..., M, 3], pi times the radiance if that is constant. Few bands ring below 0: clamp what is shown.
-
-    Raises:
-        ValueError: A shape is different, a normal's length is not 1, or C is not a square.
-    """
+    `values` are SH coefficients of radiance, [..., C, 3]; `normals` have unit length, [M, 3]. The result is float64
+    [..., M, 3], pi times the radiance if that is constant. Few bands ring below 0: clamp what is shown. Raises a
+    ValueError if a shape is different, a normal's length is not 1, or C is not a square."""
     values = np.asarray(values, np.float64)
     if values.ndim < 2 or values.shape[-1] != 3:
         raise ValueError(f"values: expected [..., C, 3], got {values.shape}")

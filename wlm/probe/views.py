@@ -55,15 +55,9 @@ _BUDGET = 1024  # blocks decoded per frame; many, since all are awaited
 
 @dataclass(frozen=True)
 class ViewScore(Report):
-    """The error of one kind of surface under one kind of light.
-
-    Attributes:
-        drawn: "balls" or "mesh".
-        light: One of `KINDS`.
-        views: Number of views that show the surface.
-        mse, psnr, ssim, flip: Errors over the pixels that show the surface, as in `wlm.metrics.Pictures`; NaN if no
-            view shows it.
-    """
+    """The error of one kind of surface, `drawn`, "balls" or "mesh", under one kind of `light`, one of `KINDS`, in
+    `views` pictures that show it. The errors are over the pixels that show the surface, as in `wlm.metrics.Pictures`;
+    NaN if no view shows it."""
 
     drawn: str
     light: str

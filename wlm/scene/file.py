@@ -5,10 +5,11 @@ from __future__ import annotations
 import itertools
 from typing import Annotated
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 from pydantic_core import PydanticCustomError
 
 from wlm.formats.hours import DAY
+from wlm.system import Checked
 
 FIELDS = (1.0, 150.0)
 """Smallest and largest vertical field of view, degrees."""
@@ -22,11 +23,7 @@ _Seconds = Annotated[float, Field(gt=0.0, le=3600.0)]
 _Name = Annotated[str, Field(min_length=1)]
 
 
-class _Part(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
-class Sky(_Part):
+class Sky(Checked):
     """The background at an hour, linear R, G, B radiance, and the exposure in stops."""
 
     hour: _Hour
@@ -40,7 +37,7 @@ def _not_still(path: tuple[_Vector, ...]) -> tuple[_Vector, ...]:
     return path
 
 
-class MovingObject(_Part):
+class MovingObject(Checked):
     """A mesh on a closed path of straight lines, which takes `seconds`."""
 
     mesh: _Name
@@ -48,7 +45,7 @@ class MovingObject(_Part):
     seconds: _Seconds
 
 
-class Smoke(_Part):
+class Smoke(Checked):
     """A folder of six-way lightmaps, played at `rate` frames a second on a square of the side `size`."""
 
     files: _Name
@@ -57,7 +54,7 @@ class Smoke(_Part):
     rate: float = Field(gt=0.0, le=1000.0)
 
 
-class CameraRow(_Part):
+class CameraRow(Checked):
     """The camera at a second of the film; `fov` is the vertical field of view in degrees."""
 
     second: float = Field(ge=0.0, le=3600.0)
@@ -73,7 +70,7 @@ class CameraRow(_Part):
         return self
 
 
-class Day(_Part):
+class Day(Checked):
     """The hours of the film, which may end on the next day, and its length."""
 
     first: float = Field(0.0, ge=0.0, le=DAY)
@@ -96,7 +93,7 @@ def _rising(name: str):
     return AfterValidator(check)
 
 
-class SceneFile(_Part):
+class SceneFile(Checked):
     """All keys of the file. File names are relative to its folder."""
 
     title: str = Field(max_length=200)

@@ -31,12 +31,8 @@ class Mesh:
 
 
 def read_mesh(path: str | os.PathLike[str], *, with_uv: bool = False) -> Mesh:
-    """Reads all triangles that a glTF file draws.
-
-    Args:
-        path: A `.glb` or `.gltf` file.
-        with_uv: Whether every primitive must have lightmap UVs: `TEXCOORD_1` if the file has any, else `TEXCOORD_0`.
-    """
+    """Reads all triangles that a `.glb` or `.gltf` file draws. `with_uv` tells whether every primitive must have
+    lightmap UVs: `TEXCOORD_1` if the file has any, else `TEXCOORD_0`."""
     document, primitives = read_gltf(path)
     if not primitives:
         raise WlmError(f"{path}: expected triangles, found none")

@@ -23,12 +23,8 @@ _SQUARED = np.array([2.0 * math.pi / 3.0, math.pi / 2.0, 4.0 * math.pi / 15.0])
 
 
 class DayProbes:
-    """Probes over the day on a device, whose light at any hour a volume decodes around the viewer.
-
-    Attributes:
-        decoder: The decoder of the probes.
-        volume: The volume. A frame decodes at most its budget of blocks for a new hour.
-    """
+    """Probes over the day on a device, whose light at any hour `volume` decodes around the viewer by their `decoder`,
+    at most its budget of blocks in a frame."""
 
     def __init__(self, scene: Scene, device: str = "cpu") -> None:
         """Loads the probes of a scene that has some."""

@@ -29,11 +29,8 @@ class _Header(Header):
 
 
 def encode(model: SmokeModel) -> tuple[dict[str, Any], dict[str, np.ndarray], str]:
-    """Converts a network to the contents of a file, with weights rounded to half floats.
-
-    Returns:
-        The settings, the weights by name, and a hash of the weights, which the file stores as its source.
-    """
+    """Converts a network to the contents of a file, with weights rounded to half floats. Returns the settings, the
+    weights by name, and a hash of the weights, which the file stores as its source."""
     parts = {}
     digest = hashlib.blake2b(digest_size=16)
     for name, weight in model.network.state_dict().items():
@@ -49,12 +46,8 @@ def encode(model: SmokeModel) -> tuple[dict[str, Any], dict[str, np.ndarray], st
 
 
 def decode(artifact: Artifact) -> SmokeModel:
-    """Makes a network, in float32 on the CPU, from the settings and weights of its file.
-
-    Raises:
-        WlmError: A setting is wrong.
-        ValueError: The weights do not match the settings.
-    """
+    """Makes a network, in float32 on the CPU, from the settings and weights of its file. Raises a WlmError if a setting
+    is wrong. Raises a ValueError if the weights do not match the settings."""
     header = check_settings(_Header, artifact.settings, "setting ")
     # The largest part is checked first, before memory for the network is allocated.
     lowest, channels = header.network.levels - 1, header.network.width * 2 ** (header.network.levels - 1)
@@ -76,10 +69,7 @@ def shipped() -> Path:
 
 def open_network(path: str | os.PathLike[str] | None = None) -> SmokeModel:
     """Loads a trained network, and checks that its file has the settings that its guiding maps must be rendered with.
-
-    Args:
-        path: The file; None or "fast": the network of the profile `fast`, which ships with wlm.
-    """
+    `path` is the file; None or "fast": the network of the profile `fast`, which ships with wlm."""
     path = shipped() if path is None or os.fspath(path) == "fast" else path
     model = load(path, SmokeModel.SYSTEM)
     try:

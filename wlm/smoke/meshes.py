@@ -40,10 +40,7 @@ class Surface:
 
 def read_surface(path: str | os.PathLike[str]) -> Surface:
     """Reads all triangles of a file, whose name ends in one of `SUFFIXES`, or returns them if it has not changed.
-
-    Raises:
-        WlmError: The file is missing or damaged, has no triangles or more than `MOST_TRIANGLES`.
-    """
+    Raises a WlmError if the file is missing or damaged, has no triangles or more than `MOST_TRIANGLES`."""
     try:
         status = os.stat(path)
     except OSError as error:

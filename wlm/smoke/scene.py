@@ -17,7 +17,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PlainSerializer, ValidationInfo, model_validator
+from pydantic import AfterValidator, Field, PlainSerializer, ValidationInfo, model_validator
 from pydantic_core import PydanticCustomError
 from pydantic_core.core_schema import SerializationInfo
 from scipy.spatial.transform import Rotation
@@ -30,6 +30,7 @@ from wlm.fluid.obstacles import Mesh, Trajectory, surface
 from wlm.smoke.camera import Camera
 from wlm.smoke.meshes import SUFFIXES, Surface, read_surface
 from wlm.smoke.shading import AnyLight, Light, PointLight, Ramp
+from wlm.system import Checked
 
 _SHORTEST = 1e-12
 MOST_STEPS = 1_000_000
@@ -103,9 +104,7 @@ def _stops(glow: tuple[tuple[float, float, float, float], ...]) -> tuple[tuple[f
 _Glow = Annotated[tuple[tuple[_Number, _NotNegative, _NotNegative, _NotNegative], ...], AfterValidator(_stops)]
 
 
-class _Settings(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
+class _Settings(Checked):
     def stored(self, folder: str | os.PathLike[str]) -> dict[str, Any]:
         """Returns JSON values for a file in a folder, which names meshes relative to itself."""
         return self.model_dump(mode="json", context={"folder": folder})
@@ -324,11 +323,7 @@ class Body(_Settings):
 
     @property
     def surface(self) -> Surface | None:
-        """The surface in the mesh file; None for other shapes.
-
-        Raises:
-            WlmError: The file cannot be read.
-        """
+        """The surface in the mesh file; None for other shapes. Raises a WlmError if the file cannot be read."""
         return None if self.shape in _SIZES else read_surface(self.shape)
 
     def half_extents(self, edge: float) -> np.ndarray:
@@ -585,12 +580,8 @@ class Scene(_Settings):
     def scaled(self, factor: float) -> Scene:
         """Returns the scene with its number of cells along each axis multiplied by a factor and rounded, at least 1.
 
-        The length of the longest axis stays the same; other axes change by at most half a cell.
-
-        Raises:
-            ValueError: The factor is not above 0.
-            WlmError: There are too many cells.
-        """
+        The length of the longest axis stays the same; other axes change by at most half a cell. Raises a ValueError if
+        the factor is not above 0. Raises a WlmError if there are too many cells."""
         if not 0 < factor < math.inf:
             raise ValueError(f"factor: expected a number above 0, got {factor}")
         cells = tuple(max(round(n * factor), 1) for n in self.grid.cells)
@@ -715,10 +706,8 @@ def make_camera(
 
 
 def obstacle_mesh(obstacles: Sequence[ObstacleSettings], time: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns the surfaces of obstacles at a time in seconds as triangles, for their pictures and shadows.
-
-    Returns:
-        Corners float32 [V, 3] in the world, triangles int32 [F, 3], index of each triangle's obstacle int32 [F].
+    """Returns the surfaces of obstacles at a time in seconds as triangles, for their pictures and shadows. These are
+    corners, float32 [V, 3] in the world, triangles, int32 [F, 3], and the index of each triangle's obstacle, int32 [F].
     """
     corners, triangles, owner = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], [np.zeros(0, np.int64)]
     first = 0

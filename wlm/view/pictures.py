@@ -22,8 +22,7 @@ _MARGIN, _FONT = 4, 14  # pixels
 
 def to_bytes(light: torch.Tensor | np.ndarray, white: float = 1.0) -> np.ndarray:
     """Converts linear light, [H, W, 3], or [H, W] for grey, to sRGB bytes, uint8 [H, W, 3]; light above `white` is
-    clipped.
-    """
+    clipped."""
     if not 0 < white < math.inf:
         raise ValueError(f"white: expected a number above 0, got {white}")
     if isinstance(light, torch.Tensor):

@@ -42,11 +42,7 @@ class Probes:
 
 
 def model_probes(
-    model: ProbeModel,
-    original: str | os.PathLike[str] | None,
-    key: str | None,
-    title: str,
-    time: float | None = None,
+    model: ProbeModel, original: str | os.PathLike[str] | None, key: str | None, title: str, time: float | None = None
 ) -> Probes:
     """Takes the probes of a model of one hour; the other arguments are those of `wlm.probe.places.probes_of`."""
     position, given, live, _ = probes_of(model, original, key, time)

@@ -54,14 +54,8 @@ class Lighting:
 
 @dataclass
 class Frame:
-    """A finished frame.
-
-    Attributes:
-        number: Frame number, from 1.
-        pixels: uint8 [H, W, 3] in sRGB.
-        smoke: Whether this frame or an earlier one has smoke.
-        seconds: Duration of each stage by name.
-    """
+    """A finished frame: its number from 1, and its pixels, uint8 [H, W, 3] in sRGB. `smoke` tells whether this frame or
+    an earlier one has smoke; `seconds` are the durations of the stages by name."""
 
     number: int
     pixels: np.ndarray

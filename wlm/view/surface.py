@@ -82,12 +82,7 @@ class SurfaceScene(Scene):
 
 
 def lightmap_scene(
-    model: SheetModel,
-    lightmaps: SheetFrames | None,
-    *,
-    title: str,
-    geometry: Geometry | None = None,
-    up: int = 1,
+    model: SheetModel, lightmaps: SheetFrames | None, *, title: str, geometry: Geometry | None = None, up: int = 1
 ) -> SurfaceScene:
     """Makes the scene of a sheet of lightmaps over time, beside its input of the same size if that is given, on a mesh
     with lightmap UVs or as a flat picture."""

@@ -17,16 +17,7 @@ from fractions import Fraction
 import numpy as np
 import warp as wp
 
-from wlm_kernels.atlas.patches import (
-    BINS,
-    SIZES,
-    Patch,
-    channel,
-    distance_sum,
-    samples_of,
-    spread,
-    turned,
-)
+from wlm_kernels.atlas.patches import BINS, SIZES, Patch, channel, distance_sum, samples_of, spread, turned
 
 # The margin exceeds the rounding of a bound in float32: 6e-8 of up to 765 levels, a few dozen times.
 _MARGIN = wp.constant(4.0e-3)

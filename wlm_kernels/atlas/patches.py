@@ -50,8 +50,7 @@ _HALF_BYTE = wp.constant(wp.int64(65536 * 257 // 2))
 class Patch:
     """A patch, which stores the colours of a triangle, without its samples: the index of its first one in the array of
     all, and the index `level` of its size n in `SIZES`, n = 2 ** level + 1. Packed as colours, it has the lowest and
-    highest value of each channel, and the histogram bin of the dominant colour, one number per channel.
-    """
+    highest value of each channel, and the histogram bin of the dominant colour, one number per channel."""
 
     start: int
     level: int

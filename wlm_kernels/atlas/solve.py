@@ -52,12 +52,7 @@ class System:
 
 
 @wp.kernel
-def _system(
-    weight: wp.array2d[float],
-    scale: wp.array1d[float],
-    grid: Grid,
-    system: System,
-):
+def _system(weight: wp.array2d[float], scale: wp.array1d[float], grid: Grid, system: System):
     t = wp.tid()
     for s in range(grid.nx * grid.ny):
         system.own[t, s] = 0.0

@@ -144,12 +144,7 @@ def _ways(
 
 @wp.func
 def _read_backward(
-    box: Box,
-    walls: wp.array1d[wp.uint8],
-    field: wp.array1d[float],
-    trace: Trace,
-    g: float,
-    on_field: wp.array1d[float],
+    box: Box, walls: wp.array1d[wp.uint8], field: wp.array1d[float], trace: Trace, g: float, on_field: wp.array1d[float]
 ) -> wp.vec3:
     """Adds the gradients to the eight values that a trace's end reads; returns that to its position."""
     at = stencil(box.n, box.periodic, trace.end)
@@ -294,16 +289,7 @@ def _correct(
         return
     at = stencil(box.n, box.periodic, source.end)
     on_end = _corrected_backward(
-        box,
-        walls,
-        fields.density,
-        predicted.density,
-        i,
-        at,
-        target,
-        smoke,
-        on_fields.density,
-        on_predicted.density,
+        box, walls, fields.density, predicted.density, i, at, target, smoke, on_fields.density, on_predicted.density
     )
     if hot:
         on_end += _corrected_backward(
@@ -406,14 +392,7 @@ def advect_backward(
 
 
 def source_backward(
-    box: Box,
-    walls: wp.array,
-    region: Region,
-    number: int,
-    on_fields: Fields,
-    on_values: wp.array,
-    *,
-    fixed: bool,
+    box: Box, walls: wp.array, region: Region, number: int, on_fields: Fields, on_values: wp.array, *, fixed: bool
 ) -> None:
     """Computes the gradients of `advection_sources.add_source`, which describes the first arguments, for values of at
     least 0, so that nothing is clamped.

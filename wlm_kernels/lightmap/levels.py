@@ -8,6 +8,8 @@ import warp as wp
 LEVELS = 127
 
 _MOST = wp.constant(float(LEVELS))
+_ROWS = wp.constant(16)  # weights that a thread reads before it needs the first, so that a GPU reads them together
+_Weights = wp.types.vector(16, float)
 
 
 @wp.func
@@ -16,18 +18,30 @@ def _half(value: float) -> float:
 
 
 @wp.func
+def _weights(values: wp.array3d[float], n: int, row: int, end: int, j: int) -> _Weights:
+    """Reads the weights of rows `row` to `row` + 15 of column j; a row from `end` on counts as the one before `end`."""
+    weights = _Weights()
+    for i in range(_ROWS):
+        weights[i] = values[n, wp.min(row + i, end - 1), j]
+    return weights
+
+
+@wp.func
 def _column_on_levels(values: wp.array3d[float], n: int, first: int, rows: int, j: int, out: wp.array3d[float]):
     """Rounds the `rows` weights of unit j (column j, from row `first`), and copies its bias, which follows them."""
+    end = first + rows
     most = float(0.0)
-    for i in range(rows):
-        most = wp.max(most, wp.abs(values[n, first + i, j]))
+    for row in range(first, end, _ROWS):
+        most = wp.max(most, wp.max(wp.abs(_weights(values, n, row, end, j))))
     level = _half(most) / _MOST
-    for i in range(rows):
-        whole = float(0.0)
-        if level > 0.0:
-            whole = wp.clamp(wp.rint(values[n, first + i, j] / level), -_MOST, _MOST)
-        out[n, first + i, j] = _half(whole * level)
-    out[n, first + rows, j] = values[n, first + rows, j]
+    divisor = wp.where(level > 0.0, level, 1.0)
+    for row in range(first, end, _ROWS):
+        weights = _weights(values, n, row, end, j)
+        for i in range(_ROWS):
+            whole = wp.clamp(wp.rint(weights[i] / divisor), -_MOST, _MOST)
+            if row + i < end:
+                out[n, row + i, j] = _half(whole * level)
+    out[n, end, j] = values[n, end, j]
 
 
 @wp.kernel(enable_backward=False)

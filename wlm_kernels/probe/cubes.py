@@ -116,13 +116,7 @@ def _on_edge(p: wp.vec3d, q: wp.vec3d, low: wp.float64, high: wp.float64) -> wp.
 
 @wp.func
 def _on_face(
-    p: wp.vec3d,
-    q: wp.vec3d,
-    r: wp.vec3d,
-    q_low: wp.float64,
-    q_high: wp.float64,
-    r_low: wp.float64,
-    r_high: wp.float64,
+    p: wp.vec3d, q: wp.vec3d, r: wp.vec3d, q_low: wp.float64, q_high: wp.float64, r_low: wp.float64, r_high: wp.float64
 ) -> wp.float64:
     """Returns the minimum of |p + s q + t r|^2 for s between q_low and q_high, and t between r_low and r_high."""
     across = r - (wp.dot(q, r) / wp.dot(q, q)) * q
@@ -324,12 +318,8 @@ def build(shapes, low, high, size: float | None = None) -> Cubes:
 
 
 def everything(count: int, device) -> Cubes:
-    """Returns a grid of one cube that lists all Gaussians, for sums without lists.
-
-    Args:
-        count: Number of Gaussians, K.
-        device: Device of the list.
-    """
+    """Returns a grid of one cube that lists all Gaussians, for sums without lists. `count` is K, the number of
+    Gaussians."""
     cubes = _grid(np.zeros((2, 3)), 1.0)
     cubes.start = wp.array([0, count], dtype=int, device=device)
     cubes.item = wp.array(np.arange(count, dtype=np.int32), dtype=int, device=device)

@@ -44,12 +44,8 @@ class Region:
 
 @dataclass(frozen=True)
 class DecodeKernels:
-    """The kernels that decode light at points, for one size of network and one kind of device.
-
-    Attributes:
-        device_kind: "cpu" or "cuda".
-        words: Length of the network that `pack` arranges for CUDA.
-    """
+    """The kernels that decode light at points, for one size of network and one kind of device, "cpu" or "cuda". `words`
+    is the length of the network that `pack` arranges for CUDA."""
 
     device_kind: str
     words: int

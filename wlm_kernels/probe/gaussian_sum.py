@@ -202,12 +202,8 @@ def backward(rows, shapes, cubes, x, grad_f, grad, cut: float) -> None:
 
 
 def backward_points(rows, shapes, cubes, x, grad_f, grad, cut: float) -> None:
-    """Computes the gradient of `sum` with respect to its points.
-
-    Args:
-        rows, shapes, cubes, x, grad_f, cut: As for `backward`.
-        grad: vec3 [N], written: gradient with respect to `x`.
-    """
+    """Computes the gradient of `sum` with respect to its points. `rows`, `shapes`, `cubes`, `x`, `grad_f` and `cut` are
+    as for `backward`. `grad` is vec3 [N], written: the gradient with respect to `x`."""
     cubes = cubes or everything(rows.shape[0], rows.device)
     kernel = sum_kernels(rows.shape[1] - LATENT).backward_points
     wp.launch(kernel, x.shape, inputs=[rows, shapes, cubes, x, cut, grad_f], outputs=[grad], device=rows.device)

@@ -134,12 +134,8 @@ def _reaches(shape: Shape, x: wp.vec3, d2: float, cut: float) -> bool:
 
 @wp.func
 def touches(shape: Shape, middle: wp.vec3, half: wp.vec3) -> bool:
-    """Tests whether the bounding box of a Gaussian's support meets another box.
-
-    Args:
-        shape: The Gaussian.
-        middle, half: The other box's centre and half its size.
-    """
+    """Tests whether the bounding box of a Gaussian's support meets another box. `shape` is the Gaussian. `middle` and
+    `half` are the other box's centre and half its size."""
     d = wp.abs(middle - shape.centre) - half
     return d[0] <= shape.reach[0] and d[1] <= shape.reach[1] and d[2] <= shape.reach[2]
 

@@ -47,12 +47,8 @@ def probes_at_once(latent: int, hidden: int, outputs: int) -> int:
 
 @dataclass(frozen=True)
 class NetworkKernels:
-    """The kernels of the network for one size and one kind of device.
-
-    Attributes:
-        device_kind: "cpu" or "cuda".
-        probes: Probes per block of threads on CUDA.
-    """
+    """The kernels of the network for one size and one kind of device, "cpu" or "cuda". `probes` counts the probes of a
+    block of threads on CUDA."""
 
     device_kind: str
     probes: int

@@ -248,12 +248,8 @@ class StepKernels:
 
 @functools.cache
 def step_kernels(latent: int, device_kind: str) -> StepKernels:
-    """Builds (once) the launches of a training step.
-
-    Args:
-        latent: Length L of a latent vector.
-        device_kind: "cpu" or "cuda".
-    """
+    """Builds (once) the launches of a training step. `latent` is the length L of a latent vector. `device_kind` is
+    "cpu" or "cuda"."""
     fn = functions(latent)
     vec_latent, vec_sums = fn.vec_latent, fn.vec_sums
     add, accumulate = fn.add, fn.accumulate

@@ -18,7 +18,7 @@ from PIL import Image
 import wlm
 from wlm.atlas.model import unpack_entries
 from wlm.export import write_page
-from wlm.formats.gltf import document_from_arrays
+from wlm.formats.gltf import document_from_meshes
 from wlm.formats.gltf_writer import write_glb
 from wlm.lightmap.sheet import LIGHT
 from wlm.lightmap.tiles import TileKind
@@ -381,7 +381,7 @@ def test_principal_components_and_light_between_probes_decode_as_in_python(tmp_p
     wlm.probe.save_probes(tmp_path / "probes.npz", probes.position, probes.values)
     corners = probes.position[probes.live][:3]
     corners[2] += 0.3
-    document, _ = document_from_arrays(corners, np.array([[0, 1, 2]]), np.zeros((3, 2)), "triangle")
+    document, _ = document_from_meshes([("triangle", corners, np.array([[0, 1, 2]]), np.zeros((3, 2)))], "triangle")
     write_glb(tmp_path / "triangle.glb", document, [], 0)
     files = {"mesh": tmp_path / "triangle.glb", "original": tmp_path / "probes.npz"}
     write_page(tmp_path / "page.html", [tmp_path / "probe.wlm"], **files)

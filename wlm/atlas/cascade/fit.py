@@ -36,7 +36,7 @@ from wlm.atlas.colour import quantise
 from wlm.atlas.data import LightmappedScene, Sheet
 from wlm.atlas.model import LUT_STEPS, AtlasModel, Profile, SheetPlace, snapped
 from wlm.atlas.resize import resized
-from wlm.atlas.stages import Stages, one_thread
+from wlm.atlas.stages import Stages
 from wlm.errors import WlmError
 from wlm.formats.checkpoint import Checkpoint
 from wlm.formats.exr import HALF_MAX
@@ -176,10 +176,9 @@ def tune(
     checkpoint: Checkpoint | None = None,
 ) -> Textures:
     """Tunes the textures of a cascade so that the mesh looks as it does with the original lightmap. `uv`, float32 [F,
-    3, 2], are the corners' UVs for the cascade. The checkpoint saves the state between steps.
-    """
+    3, 2], are the corners' UVs for the cascade. The checkpoint saves the state between steps."""
     device = interop.check_device(device)
-    with interop.stream(device), one_thread(device):
+    with interop.stream(device), interop.one_thread(device):
         step = _Step(sheet, uv, textures, profile, seed, device)
         graph = interop.StepGraph(step, device)
         meter, done = Meter(progress, "fit", profile.steps), 0
@@ -314,13 +313,9 @@ class _Step:
 
 
 class _Views:
-    """Supplies the points of each step for the space "views": the pixels of one random view.
-
-    Attributes:
-        triangle, barycentric: int32 [H, W], the triangle at each point, -1 for none; float32 [H, W, 2], the weights of
-            its corners 0 and 1.
-        across: Whether horizontal neighbours are compared too, besides vertical ones.
-    """
+    """Supplies the points of each step for the space "views": the pixels of one random view. `triangle`, int32 [H, W],
+    is the triangle at each point, -1 for none; `barycentric`, float32 [H, W, 2], has the weights of its corners 0 and
+    1. `across` tells whether horizontal neighbours are compared too, besides vertical ones."""
 
     across = True
 

@@ -64,8 +64,7 @@ class Packed:
 
 def pack(sheet: Sheet, clusters: Clusters | None, scale: float) -> Packed:
     """Gives the mesh new UVs in which the triangles of a group share texels; `scale` is epsilon, texels of the atlas
-    per texel of the lightmap along a side.
-    """
+    per texel of the lightmap along a side."""
     if not 0.0 < scale < math.inf:
         raise ValueError(f"scale: expected a number above 0, got {scale}")
     count = len(sheet.triangle)

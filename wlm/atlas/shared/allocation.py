@@ -135,8 +135,7 @@ def _worth(
 
 def _on_pages(size: np.ndarray) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
     """Packs rectangles, int [T, 2] texels along x and y, on as few pages of equal size as possible. Returns the first
-    texel of each, int64 [T, 2]; its page, int64 [T]; and rows and columns of a page.
-    """
+    texel of each, int64 [T, 2]; its page, int64 [T]; and rows and columns of a page."""
     order, page = np.lexsort((size[:, 0], size[:, 1])), np.empty(len(size), np.int64)
     for pages in range(max(1, -(-int(size.prod(1).sum()) // MOST_SIZE**2)), MOST_PAGES + 1):
         page[order] = np.arange(len(size)) % pages  # the sizes are spread evenly over the pages

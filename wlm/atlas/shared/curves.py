@@ -21,13 +21,13 @@ import torch
 from wlm.atlas.colour import stored
 from wlm.atlas.model import BLOCK_SIDE, COLOUR_BITS, FACTOR_BITS, MOST_COARSE, extent
 from wlm.atlas.shared.mixture import Mixtures, find_mixtures, moments
-from wlm.atlas.stages import Stages, one_thread
+from wlm.atlas.stages import Stages
 from wlm.atlas.tiles.fit import Tiles, errors, sample_weights, solve, tile_light
 from wlm.atlas.tiles.layout import Size, allocate
 from wlm.dispatch import Task, Whole, gathered
 from wlm.formats.float_texels import MOST_SIDE
 from wlm.formats.parts import Part
-from wlm.interop import check_device, moved
+from wlm.interop import check_device, moved, one_thread
 from wlm.system import Meter
 
 _RANKS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)  # candidate numbers of components
@@ -107,8 +107,7 @@ class Candidate:
     """The errors of all T tiles with a certain number of components: the mixtures (sets of factors that tiles share)
     and each tile's mixture, int [T]; the sizes of the components, and the squared error of each tile for each choice of
     them, float64 [choices, T], mean over the states; `left` estimates the error of the whole scene if tiles may have up
-    to this number of components.
-    """
+    to this number of components."""
 
     mixtures: Mixtures
     number: np.ndarray

@@ -29,11 +29,8 @@ _SAMPLER = re.compile(
 def filled(asset: str, **parts: str) -> str:
     """Reads a template from `assets` and replaces its marks `@NAME@` by `parts`.
 
-    In Markdown, the characters of NAME that have a meaning there, or in HTML, are escaped.
-
-    Raises:
-        KeyError: A mark of the template is not among `parts`.
-    """
+    In Markdown, the characters of NAME that have a meaning there, or in HTML, are escaped. Raises a KeyError if a mark
+    of the template is not among `parts`."""
     if asset.endswith(".md"):
         parts["NAME"] = _MARKDOWN.sub(r"\\\g<0>", printable(parts["NAME"]))
     return bundle.filled(__package__, asset, **{name: text.rstrip("\n") for name, text in parts.items()})

@@ -38,11 +38,8 @@ ivec2 wlm_lightmap_place(int i, float hour)
 
 
 def write_kit(bundle: Bundle, folder: Path, engine: str) -> dict[str, Any]:
-    """Writes the kit of a lightmap over time for an engine into an existing folder.
-
-    Returns:
-        Entries for the folder's index: shader, textures and buffers.
-    """
+    """Writes the kit of a lightmap over time for an engine into an existing folder. Returns entries for the folder's
+    index: shader, textures and buffers."""
     if engine == "unreal":
         return {"textures": _write_unreal(bundle, folder)}
     ending = ".bytes" if engine == "unity" else None

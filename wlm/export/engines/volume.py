@@ -6,9 +6,6 @@ from wlm.export.shading.pointers import wgsl_with_pointers
 
 def volume_module(shader: str) -> dict[str, bytes]:
     """Returns the files beside the WGSL of `wlm.probe.volume.update`, by name: `volume.js`, whose head explains its
-    use, and `read.wgsl`, for node materials.
-
-    Args:
-        shader: GLSL that reads the volume (`wlm.probe.volume.shader.volume_glsl`).
-    """
+    use, and `read.wgsl`, for node materials. `shader` is GLSL that reads the volume
+    (`wlm.probe.volume.shader.volume_glsl`)."""
     return {"volume.js": filled("volume.js").encode(), "read.wgsl": wgsl_with_pointers(shader).encode()}

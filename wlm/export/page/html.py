@@ -41,11 +41,7 @@ class Page:
     scripts: Sequence[str] = ()
 
     def write(self, path: str | os.PathLike[str]) -> int:
-        """Writes the page atomically.
-
-        Returns:
-            Size of the file in bytes.
-        """
+        """Writes the page atomically. Returns the size of the file in bytes."""
         content, places, held = bytearray(), {}, dict[bytes, list[int]]()
         for name, values in self.arrays.items():
             part = np.ascontiguousarray(values).tobytes()

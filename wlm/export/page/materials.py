@@ -16,11 +16,8 @@ def pack_materials(document: GltfDocument, primitives: Sequence[GltfPrimitive]) 
     """Returns the arrays of a page that hold base colours, none if all are white, and the mean base colour.
 
     These are `tint`, float32 [V, 3], linear, of each vertex of the primitives in turn; `picture`, float32 [V, 3], its
-    UV and layer in `pictures`, uint8 [layers, S, S, 4] in sRGB, of which the first layer is white.
-
-    Raises:
-        WlmError: A picture is missing or damaged, or a primitive lacks the UVs of its texture.
-    """
+    UV and layer in `pictures`, uint8 [layers, S, S, 4] in sRGB, of which the first layer is white. Raises a WlmError if
+    a picture is missing or damaged, or a primitive lacks the UVs of its texture."""
     with reported(document.path):
         tints = vertex_colours(document, primitives, textured=True)
         places, pictures = [], dict[int, Image.Image]()

@@ -8,10 +8,7 @@ from wlm.export.shading.writer import nodes_of
 
 def wgsl_with_pointers(text: str) -> str:
     """Translates a shader of this package to WGSL; each function has the buffers that it reads as its last parameters.
-
-    Raises:
-        ValueError: The text uses GLSL that `wlm.export.shading.tree` cannot parse.
-    """
+    Raises a ValueError if the text uses GLSL that `wlm.export.shading.tree` cannot parse."""
     return _PointerWriter(read_shader(read_words(text))).text()
 
 

@@ -29,10 +29,7 @@ class _Macro:
 
 def read_words(text: str, defined: Iterable[str] = ()) -> list[Word]:
     """Splits GLSL into tokens, expands macros and evaluates conditional directives; macros in `defined` are set to 1.
-
-    Raises:
-        ValueError: An unsupported directive, or a character that is not part of GLSL.
-    """
+    Raises a ValueError for an unsupported directive, or a character that is not part of GLSL."""
     macros = {name: _Macro(None, (Word("number", "1"),)) for name in defined}
     words: list[Word] = []
     kept = [True]

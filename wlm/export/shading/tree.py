@@ -10,18 +10,7 @@ VECTORS = {
 SCALARS = ("float", "int", "uint", "bool", "void")
 SAMPLERS = ("sampler2D", "usampler2D", "sampler2DArray")
 _TYPES = {*VECTORS, *SCALARS, *SAMPLERS}
-LEVELS = (
-    ("||",),
-    ("&&",),
-    ("|",),
-    ("^",),
-    ("&",),
-    ("==", "!="),
-    ("<", ">", "<=", ">="),
-    ("<<", ">>"),
-    ("+", "-"),
-    ("*", "/", "%"),
-)
+LEVELS = tuple(map(str.split, ("||", "&&", "|", "^", "&", "== !=", "< > <= >=", "<< >>", "+ -", "* / %")))
 _ASSIGN = ("=", "+=", "-=", "*=", "/=", "%=", "&=", "|=", "^=")
 
 
@@ -39,8 +28,7 @@ class Node:
 class Variable:
     """A parameter, constant, local or shared variable, texture, uniform or buffer of a GLSL type. `size` is the
     length of an array, else None; `way` is `in`, `out` or `inout` of a parameter or local variable, or `const`,
-    `uniform`, `shared`, `buffer` or, of a buffer that is written, `storage`; `value` is the initial value, or None.
-    """
+    `uniform`, `shared`, `buffer` or, of a buffer that is written, `storage`; `value` is the initial value, or None."""
 
     type: str
     name: str
@@ -299,9 +287,5 @@ class _Reader:
 
 
 def read_shader(words: list[Word]) -> Shader:
-    """Parses the tokens of a shader.
-
-    Raises:
-        ValueError: The text uses GLSL that this parser does not support.
-    """
+    """Parses the tokens of a shader. Raises a ValueError if the text uses GLSL that this parser does not support."""
     return _Reader(words).shader()

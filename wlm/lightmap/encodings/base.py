@@ -49,11 +49,8 @@ class Encoding(ABC):
         return b""
 
     def unpack(self, sheet: SheetModel, number: int, data: np.ndarray) -> None:  # noqa: B027
-        """Writes a tile, given as the bytes of `pack`, uint8, into the arrays of a sheet.
-
-        Raises:
-            WlmError, ValueError: The bytes are not a valid tile of this encoding.
-        """
+        """Writes a tile, given as the bytes of `pack`, uint8, into the arrays of a sheet. Raises a WlmError or
+        ValueError if the bytes are not a valid tile of this encoding."""
 
     @abstractmethod
     def upload(self, sheet: SheetModel, device: str, gelu: str) -> list[DeviceTiles]:

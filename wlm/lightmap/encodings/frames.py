@@ -17,7 +17,7 @@ import numpy as np
 import warp as wp
 
 from wlm.bundle import Texture
-from wlm.errors import WlmError
+from wlm.errors import WlmError, counted
 from wlm.formats import bc7
 from wlm.formats.folder import rounded
 from wlm.lightmap.encodings.base import DeviceTiles, Encoding, side_by_side
@@ -38,10 +38,9 @@ def missing_encoder(count: int) -> str | None:
     """Returns a warning about `count` tiles that would be stored as frames, or None if the encoder is installed."""
     if importlib.util.find_spec(_ENCODER) is not None:
         return None
-    tiles = "1 tile" if count == 1 else f"{count} tiles"
     return (
-        f"{tiles} would take no more bytes as BC7 frames, but {_ENCODER} is missing, so networks are fitted "
-        f"to them; needs the extra: pip install 'wlm[{EXTRA}]'"
+        f"{counted(count, 'tile')} would take no more bytes as BC7 frames, but {_ENCODER} is missing, so networks are "
+        f"fitted to them; needs the extra: pip install 'wlm[{EXTRA}]'"
     )
 
 

@@ -18,11 +18,7 @@ _LEAD = 1 / 24  # of the period, or of the time between the first and the last s
 
 class Clock:
     """Converts times to rows of `wlm_kernels.lightmap.virtual.Work.clock`, and follows the clock through switches.
-
-    Attributes:
-        axis: The time axis of the model.
-        switches: Indices of the stored times before each switch.
-    """
+    `axis` is the time axis of the model; `switches` are the indices of the stored times before each switch."""
 
     def __init__(self, axis: TimeAxis) -> None:
         """Finds the switches among the stored times."""

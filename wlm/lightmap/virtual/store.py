@@ -44,12 +44,8 @@ _REQUESTS = 64  # most tiles that wait for the loader
 
 
 class _Pool:
-    """Device memory for tiles of one kind, in slots.
-
-    Attributes:
-        owner: int [slots], the tile in each slot, or -1.
-        arrays: The arrays of the tiles by name: parts of one memory, so that tiles are uploaded with one copy.
-    """
+    """Device memory for tiles of one kind, in slots: `owner`, int [slots], is the tile in each slot, or -1, and
+    `arrays` has the tiles' arrays by name, as parts of one memory, so that tiles are uploaded with one copy."""
 
     def __init__(self, shapes: dict[str, tuple[Any, tuple[int, ...]]], slots: int, device: str) -> None:
         """Allocates the slots; `shapes` has for each array its type, and its shape of one tile, whose first axis is
@@ -127,14 +123,7 @@ class TileStore:
     """
 
     def __init__(
-        self,
-        model: LightmapModel,
-        layout: Layout,
-        first: int,
-        device: str,
-        gelu: str,
-        room: int | None,
-        clock: Clock,
+        self, model: LightmapModel, layout: Layout, first: int, device: str, gelu: str, room: int | None, clock: Clock
     ) -> None:
         """Reads all tiles and uploads as many as fit into `room` bytes; for the errors see `VirtualTexture`.
 
@@ -543,9 +532,6 @@ def _changes(words: np.ndarray, periodic: bool) -> np.ndarray:
 
 def page_changes(layout: Layout, change: np.ndarray) -> np.ndarray:
     """Adds up the changes of the pages' light, see `wlm_kernels.lightmap.virtual.Pages`, from `TileStore.change`.
-
-    Returns:
-        float32 [P, T + 1]; a page changes as much as the tile below it that changes most.
-    """
+    Returns float32 [P, T + 1]; a page changes as much as the tile below it that changes most."""
     largest = np.stack([change[layout.below(page)].max(0) for page in range(len(layout.parent))])
     return np.concatenate([np.zeros((len(largest), 1)), np.cumsum(largest, 1)], 1).astype(np.float32)

@@ -55,12 +55,9 @@ def write_kit(
     If `original` is the `.lmbake` that was compressed, a copy of it gets the model's light. Otherwise the bake has
     probes at the corners of cubic cells that fill the probes' box, 1 to 64 `cells` along its longest side (None: 24).
     If the decoder needs the probes' positions and the model stores none, they are read from `original`. `axes` are the
-    scene's axes that become Godot's (`wlm.probe.axes`); a bake has Godot's own already.
-
-    Raises:
-        WlmError: A probe has other than 9 coefficients, `cells` is out of range or given with an `.lmbake`, the
-            `.lmbake` has other probes, the light exceeds float32, or the device does not exist.
-    """
+    scene's axes that become Godot's (`wlm.probe.axes`); a bake has Godot's own already. Raises a WlmError if a probe
+    has other than 9 coefficients, `cells` is out of range or given with an `.lmbake`, the `.lmbake` has other probes,
+    the light exceeds float32, or the device does not exist."""
     model = bundle.model.at()
     bake = original if original is not None and Path(original).suffix.lower() == ".lmbake" else None
     info: dict[str, object] = {"probes": model.probes}
@@ -97,14 +94,9 @@ def tetrahedra_of(count: np.ndarray) -> np.ndarray:
 
 
 def tree_of(low: np.ndarray, size: float, count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Makes Godot's BSP tree, whose planes lead to the tetrahedron of a point: five in each cell of a lattice.
-
-    Args:
-        low, size, count: Attributes of the `Lattice`.
-
-    Returns:
-        The planes, float64 [M, 4], and the children of each node, int32 [M, 2], as in `wlm.formats.godot`.
-    """
+    """Makes Godot's BSP tree, whose planes lead to the tetrahedron of a point: five in each cell of a lattice. `low`,
+    `size` and `count` are attributes of the `Lattice`. Returns the planes, float64 [M, 4], and the children of each
+    node, int32 [M, 2], as in `wlm.formats.godot`."""
     cells = int(np.prod(count))
     inner = cells - 1  # nodes above the cells; the cells' own nodes, five each, follow in the order of the cells
     planes, children = np.zeros((inner + 5 * cells, 4)), np.zeros((inner + 5 * cells, 2), np.int32)

@@ -44,13 +44,9 @@ def write_kit(
 
     Unity is left-handed: importers mirror a glTF scene along x or z, hence `axes` "-x,y,z" or "x,y,-z"
     (`wlm.probe.axes`), or None for a scene that came from Unity. The positions are read from `original`, the file that
-    was compressed; if it is None, the stored positions are used.
-
-    Raises:
-        WlmError: The numbers are not spherical harmonics of order 0 to 2, there are over 131,072 probes, the axis does
-            not exist, the positions are unknown or of other probes, a number exceeds float32, or the device does not
-            exist.
-    """
+    was compressed; if it is None, the stored positions are used. Raises a WlmError if the numbers are not spherical
+    harmonics of order 0 to 2, there are over 131,072 probes, the axis does not exist, the positions are unknown or of
+    other probes, a number exceeds float32, or the device does not exist."""
     model, position = bundle.model.at(), positions_of(bundle.model, original)
     coefficients = sh_count(model.outputs)
     if coefficients is None or coefficients > _L2:

@@ -39,11 +39,8 @@ _ABOUT = {
 
 
 def gaussian_bundle(model: ProbeModel, decoder: Decoder) -> Bundle:
-    """Returns the shader, buffers and examples for a model of Gaussians; `decoder` computes the examples' light.
-
-    Raises:
-        WlmError: The probes' box exceeds float32.
-    """
+    """Returns the shader, buffers and examples for a model of Gaussians; `decoder` computes the examples' light. Raises
+    a WlmError if the probes' box exceeds float32."""
     content = model.content
     position = _reference_positions(model, content)
     scale = np.exp(content.rows()[:, SCALE]).astype(np.float64)

@@ -18,15 +18,10 @@ from wlm_kernels.probe.decode import Region, decode_kernels
 
 
 class Points:
-    """Points on a device, in the order in which decoding them is fastest.
-
-    Attributes:
-        x: vec3 [M], the points relative to the probes' box, sorted by region, then by cube, whose list neighbouring
-            threads share, then along a Z-curve (Morton order).
-        region: int [M], region of each point; [0] for a model without regions.
-        order: int [M], index in the input of each point of `x`.
-        out: float [M, D], written by the decoder's `run`.
-    """
+    """Points on a device, in the order in which decoding them is fastest. `x`, vec3 [M], are the points relative to the
+    probes' box, sorted by region, then by cube, whose list neighbouring threads share, then along a Z-curve (Morton
+    order). `region`, int [M], is the region of each point, [0] for a model without regions; `order`, int [M], its index
+    in the input. `out`, float [M, D], is written by the decoder's `run`."""
 
     def __init__(
         self, x: np.ndarray, cube: np.ndarray, outputs: int, device: str, region: np.ndarray | None = None
@@ -67,11 +62,8 @@ class PointDecoder(Decoder):
 
 
 class GaussianDecoder(PointDecoder):
-    """A model of Gaussians on a device, with a list of the Gaussians that reach each cube of a grid.
-
-    Attributes:
-        pairs: Total number of entries in these lists.
-    """
+    """A model of Gaussians on a device, with a list of the Gaussians that reach each cube of a grid; `pairs` is the
+    total number of entries in these lists."""
 
     def __init__(self, model: ProbeModel, device: str = "cpu", *, position: np.ndarray | None = None) -> None:
         """Loads a model of Gaussians; arguments and errors are those of `wlm.probe.decode.Decoder`."""

@@ -83,11 +83,8 @@ class WholeNumbers:
         ]
 
     def codes(self) -> dict[str, np.ndarray]:
-        """Computes from whole numbers what a GPU holds: `code`, `levels`, `bounds` and `net` of `Gaussians`.
-
-        Raises:
-            ValueError: The whole numbers of a channel span more than 16 bits, or a rotation exceeds half a turn.
-        """
+        """Computes from whole numbers what a GPU holds: `code`, `levels`, `bounds` and `net` of `Gaussians`. Raises a
+        ValueError if the whole numbers of a channel span more than 16 bits, or a rotation exceeds half a turn."""
         low, high = self.gaussians.min(0), self.gaussians.max(0)
         turn = self.gaussians[:, STORED_ROTATION] * self.step[STORED_ROTATION]
         square = np.square(turn).sum(1, keepdims=True)
@@ -290,11 +287,8 @@ def layer_shapes(latent: int, hidden: int, outputs: int) -> list[tuple[int, int]
 
 
 def check_outputs(name: str, latent: int, hidden: int, outputs: int, relative: bool, device: str) -> None:
-    """Checks that kernels can be compiled for `outputs` numbers per probe; on the CPU there is no limit.
-
-    Raises:
-        WlmError: There are too many numbers per probe for CUDA.
-    """
+    """Checks that kernels can be compiled for `outputs` numbers per probe; on the CPU there is no limit. Raises a
+    WlmError if there are too many numbers per probe for CUDA."""
     most = most_outputs(latent, hidden) - relative
     if device != "cpu" and outputs > most:
         raise WlmError(
@@ -309,14 +303,8 @@ def gaussian_count(ratio: float, live: int) -> int:
 
 
 def least_turned(rows: np.ndarray) -> np.ndarray:
-    """Returns equivalent Gaussians with the smallest rotation angle, by reordering the axes of each ellipsoid.
-
-    Args:
-        rows: [K, 10 + L], as from `Gaussians.rows`.
-
-    Returns:
-        float64 [K, 9 + L], channels as in `WholeNumbers`.
-    """
+    """Returns equivalent Gaussians with the smallest rotation angle, by reordering the axes of each ellipsoid. `rows`
+    is [K, 10 + L], as from `Gaussians.rows`. The result is float64 [K, 9 + L], channels as in `WholeNumbers`."""
     rows = rows.astype(np.float64)
     quaternion = rows[:, ROTATION]
     none = np.linalg.norm(quaternion, axis=1, keepdims=True) < _SHORTEST

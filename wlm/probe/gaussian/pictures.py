@@ -53,11 +53,8 @@ class Pixels(NamedTuple):
 
 def seen_pixels(probes: ProbeSet, geometry: Geometry, device: str = "cpu", seed: int = 0) -> Pixels:
     """Returns pixels of balls at all live probes, seen from everywhere, and pixels in which viewers at random probes
-    see a mesh, lit by the nearest probes like those of `wlm.probe.views`. `seed` chooses viewers and pixels.
-
-    Raises:
-        WlmError: The probes' numbers are not spherical harmonics, or no viewer sees the mesh.
-    """
+    see a mesh, lit by the nearest probes like those of `wlm.probe.views`. `seed` chooses viewers and pixels. Raises a
+    WlmError if the probes' numbers are not spherical harmonics, or no viewer sees the mesh."""
     position, light = probes.position[probes.live], probes.values[probes.live].astype(np.float64)
     count, hours = sh_count(probes.outputs), max(len(probes.times), 1)
     if count is None:

@@ -25,15 +25,9 @@ _LONGEST = """
 
 
 def probe_glsl(content: Gaussians) -> str:
-    """Returns the GLSL for models with the sizes of `content`: functions to be included below `#version`.
-
-    Args:
-        content: Gaussians, of which only the latent, the hidden units, the outputs and their form, and the support
-            matter.
-
-    Returns:
-        GLSL 4.30, which is also valid Vulkan GLSL.
-    """
+    """Returns the GLSL for models with the sizes of `content`: functions to be included below `#version`. `content` has
+    the Gaussians, of which only the latent, the hidden units, the outputs and their form, and the support matter. It is
+    GLSL 4.30, which is also valid Vulkan GLSL."""
     latent, hidden = content.latent, content.hidden
     channels = LATENT.start + latent
     sphere = content.support == "sphere"

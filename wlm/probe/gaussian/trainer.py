@@ -374,11 +374,8 @@ class Trainer:
         )
 
     def state(self) -> dict[str, np.ndarray]:
-        """Returns the arrays on which later steps depend, by name.
-
-        Raises:
-            WlmError: The fit diverged: a number is not finite.
-        """
+        """Returns the arrays on which later steps depend, by name. Raises a WlmError if the fit diverged: a number is
+        not finite."""
         result = {key: self._tensors[key].cpu().numpy().copy() for key in _STATE}
         if not all(map(all_finite, result.values())):
             raise WlmError(f"the fit diverged; use smaller learning rates than profile {self._name}")
@@ -396,11 +393,8 @@ class Trainer:
 
     def load(self, state: dict[str, np.ndarray]) -> None:
         """Continues from the arrays that `state` of a trainer with the same arguments returned, exactly as that one.
-
-        Raises:
-            ValueError: An array is missing, has another type or shape, or a number is out of its range; the trainer is
-                unchanged.
-        """
+        Raises a ValueError if an array is missing, has another type or shape, or a number is out of its range; the
+        trainer is unchanged."""
         done = check_part(state, "control", Part(np.int32, (1,), least=0, most=self.steps))
         state = check_parts(state, self.table(int(done[0])))
         if not state["kept"].any() or (state["bounds"][0] > state["bounds"][1]).any():
@@ -450,15 +444,9 @@ def _first_numbers(
 
 
 def local_spread(x: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Returns how much the light varies around each probe.
-
-    Args:
-        x: [N, 3], positions of the probes.
-        values: [N, D], the numbers of these probes.
-
-    Returns:
-        float64 [N], positive: the standard deviation over each probe and its eight nearest, plus a small floor.
-    """
+    """Returns how much the light varies around each probe. `x` are positions of probes, [N, 3], and `values` their
+    numbers, [N, D]. The result is float64 [N], positive: the standard deviation over each probe and its eight nearest,
+    plus a small floor."""
     near = cKDTree(x).query(x, k=min(_NEIGHBOURS, len(x)), workers=-1)[1].reshape(len(x), -1)
     # In pieces: all neighbours' numbers at once would be nine times the set.
     pieces = (near[start : start + _PIECE] for start in range(0, len(near), _PIECE))

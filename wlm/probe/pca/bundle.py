@@ -55,15 +55,9 @@ def component_bundle(model: ProbeModel, decoder: Decoder) -> Bundle:
 
 
 def component_glsl(outputs: int, kind: str) -> str:
-    """Returns the GLSL for models with the given sizes: functions to be included below `#version`.
-
-    Args:
-        outputs: Numbers per probe.
-        kind: Type of the directions that the model stores, "int8" or "float16"; "" if they are the unit vectors.
-
-    Returns:
-        GLSL 4.30, which is also valid Vulkan GLSL.
-    """
+    """Returns the GLSL for models with the given sizes: functions to be included below `#version`. `outputs` is the
+    count of numbers per probe; `kind` is the type of the directions that the model stores, "int8" or "float16"; "" if
+    they are the unit vectors. It is GLSL 4.30, which is also valid Vulkan GLSL."""
     form = _KINDS.get(kind, {"per_word": 1})
     words = -(-outputs // form["per_word"]) if kind else 0
     text = filled(

@@ -17,12 +17,8 @@ _BUDGET = 1024  # blocks that the volume decodes per frame; many, since all are 
 
 
 class ComponentDecoder(Decoder, Light):
-    """A model of principal components on a device, stored packed, and the light of its probes for a volume.
-
-    Attributes:
-        count: Number of probes, N.
-        channels: Numbers per probe, D.
-    """
+    """A model of principal components on a device, stored packed, and the light of its `count` probes, of `channels`
+    numbers each, for a volume."""
 
     def __init__(self, model: ProbeModel, device: str = "cpu", *, position: np.ndarray | None = None) -> None:
         """Loads a model of principal components; arguments and errors are those of `wlm.probe.decode.Decoder`."""

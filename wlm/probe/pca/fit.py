@@ -91,12 +91,7 @@ class _Plan(NamedTuple):
 
 
 def fit_components(
-    values: np.ndarray,
-    most_bytes: int | None = None,
-    hours: int = 1,
-    enough: float = ENOUGH,
-    *,
-    relative: bool = True,
+    values: np.ndarray, most_bytes: int | None = None, hours: int = 1, enough: float = ENOUGH, *, relative: bool = True
 ) -> tuple[Components, float]:
     """Compresses live probes to the smallest GPU buffers whose error is at most `enough`, over all hours.
 

@@ -31,15 +31,9 @@ class RegionDecoder(PointDecoder):
     def __init__(
         self, model: ProbeModel, device: str = "cpu", *, position: np.ndarray | None = None, most_bytes: int = MEMORY
     ) -> None:
-        """Prepares an empty decoder.
-
-        Args:
-            model, device, position: As for `wlm.probe.decode.Decoder`.
-            most_bytes: Bytes of device memory for regions. Regions that are needed at once may take more.
-
-        Raises:
-            WlmError: As for `wlm.probe.decode.Decoder`.
-        """
+        """Prepares an empty decoder. `model`, `device` and `position` are as for `wlm.probe.decode.Decoder`.
+        `most_bytes` are bytes of device memory for regions. Regions that are needed at once may take more. Errors are
+        those of `wlm.probe.decode.Decoder`."""
         super().__init__(model, device, position=position)
         assert isinstance(model.content, Regions)
         self._content = content = model.content
@@ -71,11 +65,8 @@ class RegionDecoder(PointDecoder):
             each.set_time(time)
 
     def load(self, regions: np.ndarray) -> None:
-        """Brings regions, int [M], onto the device, in place of others if there is no room.
-
-        Raises:
-            WlmError: A region is damaged; those before it are loaded.
-        """
+        """Brings regions, int [M], onto the device, in place of others if there is no room. Raises a WlmError if a
+        region is damaged; those before it are loaded."""
         missing = [number for number in regions.tolist() if not self._touch(number)]
         try:
             for number in missing:
@@ -132,11 +123,8 @@ class RegionDecoder(PointDecoder):
 
     def request(self) -> None:
         """Has a thread read the regions that launches since the last call needed, and moves at most one that was read
-        to the device. If it is damaged, its light is 0 from now on.
-
-        Raises:
-            WlmError: The region is damaged; it is only told once.
-        """
+        to the device. If it is damaged, its light is 0 from now on. Raises a WlmError if the region is damaged; it is
+        only told once."""
         asked = np.flatnonzero(self._asked.numpy())
         if len(asked):
             self._asked.zero_()

@@ -68,11 +68,8 @@ class Regions(Content):
         return gaussian_bytes(int(self.counts[number, 0]), profile.latent, profile.hidden, columns, hours)
 
     def region(self, number: int) -> ProbeModel:
-        """Unpacks a region.
-
-        Raises:
-            WlmError: There is no such region, or its bytes are damaged or do not fit the others.
-        """
+        """Unpacks a region. Raises a WlmError if there is no such region, or its bytes are damaged or do not fit the
+        others."""
         if not 0 <= number < self.tree.count:
             raise WlmError(f"{self.name}: region: expected 0 to {self.tree.count - 1}, got {number}")
         try:

@@ -8,13 +8,9 @@ import numpy as np
 
 @dataclass(frozen=True, eq=False)
 class Tree:
-    """A k-d tree whose leaves are R regions; node 0 is its root.
-
-    Attributes:
-        axis: int32 [R - 1], axis along which each node splits space.
-        plane: float64 [R - 1], coordinate at which it splits; points at the plane belong to the upper half.
-        child: int32 [R - 1, 2], for the lower and the upper half the number of a later node, or -1 - r of region r.
-    """
+    """A k-d tree whose leaves are R regions; node 0 is its root. A node splits space along `axis`, int32 [R - 1], at
+    the coordinate `plane`, float64 [R - 1], whose points belong to the upper half. `child`, int32 [R - 1, 2], is for
+    the lower and the upper half the number of a later node, or -1 - r of region r."""
 
     axis: np.ndarray
     plane: np.ndarray

@@ -27,11 +27,8 @@ _ABOUT = {
 
 
 def volume_bundle(volume: Volume) -> Bundle:
-    """Returns the GPU buffers and shader of a volume in its state after the last update.
-
-    Raises:
-        WlmError: The volume has no block yet.
-    """
+    """Returns the GPU buffers and shader of a volume in its state after the last update. Raises a WlmError if the
+    volume has no block yet."""
     state = volume.state()
     rows, pages = np.unique(state.pages[state.pages >= 0]), state.pages
     if not len(rows):

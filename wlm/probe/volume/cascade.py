@@ -381,11 +381,8 @@ class Volume:
 
 
 def _unit(normal: np.ndarray | None, shape: tuple[int, ...]) -> np.ndarray:
-    """Normalises vectors and returns them in float32; vectors of length 0 stay 0.
-
-    Raises:
-        ValueError: The shape is different, or a number is not finite.
-    """
+    """Normalises vectors and returns them in float32; vectors of length 0 stay 0. Raises a ValueError if the shape is
+    different, or a number is not finite."""
     if normal is None:
         return np.zeros(shape, np.float32)
     normal = np.asarray(normal, np.float64)

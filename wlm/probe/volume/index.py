@@ -98,17 +98,9 @@ def finest_side(position: np.ndarray) -> float:
 
     The light is linear between blocks, so more blocks than probes are needed to reproduce the probes. Probes scattered
     over surfaces have at least two blocks each at this side. Probes on a lattice have fewer; for them the side is
-    reduced in steps of a fifth until there are two blocks per probe.
-
-    Args:
-        position: [N, 3].
-
-    Returns:
-        The side, in the unit of the positions; 1 if there are fewer than two distinct positions.
-
-    Raises:
-        WlmError: The positions are so far apart, or so close, that float64 does not hold their distances.
-    """
+    reduced in steps of a fifth until there are two blocks per probe. The side is in the unit of the positions, [N, 3];
+    it is 1 if there are fewer than two distinct positions. Raises a WlmError if the positions are so far apart, or so
+    close, that float64 does not hold their distances."""
     places = np.asarray(position, np.float64)
     places = places[np.lexsort(places.T)]
     places = places[np.append(True, (places[1:] != places[:-1]).any(1))[: len(places)]]

@@ -14,14 +14,8 @@ ABSENT = -np.inf
 
 
 class Light(Protocol):
-    """A source of the light of N probes.
-
-    Attributes:
-        device: "cpu" or "cuda:N".
-        count: Number of probes, N.
-        channels: Numbers per probe, D.
-        time: Hour of the day of the light that `read` writes, from 0 to 24; None if it never changes.
-    """
+    """A source of the light of `count` probes of `channels` numbers each, on a device, "cpu" or "cuda:N". `time` is the
+    hour of the day of the light that `read` writes, from 0 to 24; None if it never changes."""
 
     device: str
     count: int
@@ -37,11 +31,7 @@ class Light(Protocol):
 
     def prepare(self, numbers: np.ndarray | None = None) -> None:
         """Brings light into memory: that of the probes `numbers`, int [M], at once; None, before a frame: what earlier
-        frames lacked, as far as it has come.
-
-        Raises:
-            WlmError: A part of the model is damaged.
-        """
+        frames lacked, as far as it has come. Raises a WlmError if a part of the model is damaged."""
         return
 
     def read(self, numbers: wp.array, values: wp.array) -> None:
@@ -61,16 +51,8 @@ class StoredLight(Light):
     time = None
 
     def __init__(self, values: np.ndarray, device: str = "cpu") -> None:
-        """Uploads the probes.
-
-        Args:
-            values: [N, D] or [N, C, 3].
-            device: "cpu" or "cuda:N".
-
-        Raises:
-            WlmError: The device does not exist, or a number is not finite.
-            ValueError: The shape is different.
-        """
+        """Uploads the probes, `values` [N, D] or [N, C, 3], to the device "cpu" or "cuda:N". Raises a WlmError if the
+        device does not exist, or a number is not finite. Raises a ValueError if the shape is different."""
         values = np.asarray(values, np.float32)
         if values.ndim == 3:
             values = values.reshape(len(values), -1)

@@ -16,15 +16,9 @@ def row_words(outputs: int) -> int:
 
 
 def volume_glsl(outputs: int) -> str:
-    """Returns the GLSL that reads a volume: functions to be included below `#version`.
-
-    Args:
-        outputs: Numbers per probe, D; for spherical harmonics of L0 to L2 in RGB there is also a function for a diffuse
-            surface.
-
-    Returns:
-        GLSL 4.30, which is also valid Vulkan GLSL.
-    """
+    """Returns the GLSL that reads a volume: functions to be included below `#version`. `outputs` is D, the count of
+    numbers per probe; for spherical harmonics of L0 to L2 in RGB there is also a function for a diffuse surface. It is
+    GLSL 4.30, which is also valid Vulkan GLSL."""
     buffers = [buffer_glsl("volume", name, number) for number, name in enumerate(_BUFFERS)]
     words = {"head": HEAD_WORDS, "level_words": LEVEL_WORDS, "row_words": row_words(outputs)}
     text = filled(__package__, "read.glsl", buffers="".join(buffers), outputs=outputs, **words)

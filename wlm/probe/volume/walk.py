@@ -100,15 +100,8 @@ def walk(
 
 
 def settle(volume: Volume, viewpoint: np.ndarray) -> int:
-    """Updates a volume at one viewpoint until no block waits, or no memory is free for the waiting blocks.
-
-    Args:
-        volume: A volume in any state.
-        viewpoint: [3].
-
-    Returns:
-        The number of frames that it took.
-    """
+    """Updates a volume at one viewpoint until no block waits, or no memory is free for the waiting blocks. The volume
+    may be in any state; `viewpoint` is [3]. Returns the number of frames that it took."""
     frames, idle = 1, 0
     left = volume.update(viewpoint).left
     # Groups of the pool's rows take turns: the next frame may have a free row even if this one has none.

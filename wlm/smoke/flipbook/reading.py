@@ -143,11 +143,8 @@ def front_camera(height: int, width: int) -> Camera:
 
 
 def read_layers(path: str | os.PathLike[str], notes: list[str]) -> dict[str, np.ndarray]:
-    """Reads the six-way lightmaps of an EXR file whose channels, layers or parts are named after directions.
-
-    Returns:
-        float32 [H, W] per direction, and `ALPHA` and `EMISSION` if there are channels for them.
-    """
+    """Reads the six-way lightmaps of an EXR file whose channels, layers or parts are named after directions. Returns
+    float32 [H, W] per direction, and `ALPHA` and `EMISSION` if there are channels for them."""
     pixels, names = read_every_channel(path, notes)
     roles = six_way_channels(names)
     if not roles:

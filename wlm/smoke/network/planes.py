@@ -18,10 +18,7 @@ from wlm_kernels.smoke.settings import March
 PLANES = (*DIRECTIONS, "opacity", "emission")
 """Planes that the network predicts, in order."""
 
-GUIDES = {
-    "paper": ("light", "opacity", "depth"),
-    "six": (*DIRECTIONS, "emission", "opacity", "depth"),
-}
+GUIDES = {"paper": ("light", "opacity", "depth"), "six": (*DIRECTIONS, "emission", "opacity", "depth")}
 """Planes of each kind of guiding map; opacity and depth are last. The paper's has the light from the front, the top and
 the bottom in one plane; "six" is ours: the coarse march, with a plane for each light."""
 

@@ -4,11 +4,11 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, ClassVar, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 from pydantic_core import PydanticCustomError
 
 from wlm.smoke.network.planes import GUIDES
-from wlm.system import Settings
+from wlm.system import Checked, Settings
 from wlm_kernels.smoke.settings import LEAST_STEP, March
 
 EDGE, SPEED, LATTICE_SPEED = 1.0, 1.0, 0.1
@@ -26,10 +26,8 @@ _Positive = Annotated[float, Field(gt=0.0)]
 _Range = tuple[_Positive, _Positive]
 
 
-class NetworkSettings(BaseModel):
+class NetworkSettings(Checked):
     """Settings of the network's layers and of its input."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
     width: int = Field(16, ge=8, le=64, multiple_of=8)
     """Channels of the U-Net's first level. Each further level has twice the channels at half the resolution."""
@@ -54,10 +52,8 @@ class NetworkSettings(BaseModel):
         return self.stem * 2 ** (self.levels - 1)
 
 
-class DatasetSettings(BaseModel):
+class DatasetSettings(Checked):
     """Settings of the samples. Lengths are shares of the box's edge; times are multiples of the box's crossing time."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
 
     cells: int = Field(50, ge=16, le=512)
     """Velocity cells along each edge of the box."""
@@ -161,10 +157,8 @@ class DatasetSettings(BaseModel):
         return March(step, spacing, jitter=self.jitter, seed=seed, threshold=threshold)
 
 
-class TrainSettings(BaseModel):
+class TrainSettings(Checked):
     """Settings of the optimisation: its length, batches, learning rate and losses."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
 
     rounds: int = Field(20, ge=1)
     """Number of rounds; each simulates new samples and trains on them."""

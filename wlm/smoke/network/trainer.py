@@ -65,12 +65,8 @@ class Trainer:
         self._sums.zero_()
 
     def run(self, pool: Pool, plan: Plan) -> None:
-        """Runs the training steps of a plan.
-
-        Args:
-            pool: The samples, on any device.
-            plan: A part of the result of `plan_round`: the samples of each step.
-        """
+        """Runs the training steps of a plan. `pool` has the samples, on any device. `plan` is a part of the result of
+        `plan_round`: the samples of each step."""
         # Deterministic kernels, so that a seed gives one result.
         flags = {"enabled": True, "benchmark": False, "deterministic": True, "allow_tf32": self.settings.half}
         with torch.backends.cudnn.flags(**flags):
@@ -159,11 +155,8 @@ class Trainer:
 
     @torch.no_grad()
     def load(self, state: dict[str, np.ndarray]) -> None:
-        """Restores what `state` returned.
-
-        Raises:
-            ValueError: An array is missing, has a wrong shape or is out of its range; the trainer is unchanged.
-        """
+        """Restores what `state` returned. Raises a ValueError if an array is missing, has a wrong shape or is out of
+        its range; the trainer is unchanged."""
         done = check_part(state, "step", Part(np.int64, (), least=0, most=self.settings.total))
         state = check_parts(state, self.table(int(done)))
         values = {name: torch.from_numpy(np.array(value)) for name, value in state.items()}
@@ -189,8 +182,7 @@ def _mirrored(planes: tuple[str, ...], device: str) -> torch.Tensor:
 class Plan:
     """The samples that some training steps use: indices in a pool, int [steps, B], which of a sample's two frames is
     used, 0 or 1, ignored with a temporal loss; whether it is mirrored left to right; and `corners`, int [steps, B, 2],
-    row and column of the top left pixel of the crop; None: whole images.
-    """
+    row and column of the top left pixel of the crop; None: whole images."""
 
     samples: torch.Tensor
     frames: torch.Tensor
