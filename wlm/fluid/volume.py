@@ -147,9 +147,10 @@ class DensityVolume:
             yield slab[: self.shape[0] - EDGE * x, : self.shape[1], : self.shape[2]]
 
     def arrays(self) -> tuple[wp.array, wp.array | None]:
-        """Returns density and temperature as Warp arrays of three axes that share the tensors' memory."""
-        hot = None if self.temperature is None else to_warp(self.temperature.flatten(0, -3))
-        return to_warp(self.density.flatten(0, -3)), hot
+        """Returns density and temperature as contiguous Warp arrays of three axes, which share the tensors' memory if
+        these are contiguous."""
+        hot = None if self.temperature is None else to_warp(self.temperature.flatten(0, -3).contiguous())
+        return to_warp(self.density.flatten(0, -3).contiguous()), hot
 
 
 def from_array(

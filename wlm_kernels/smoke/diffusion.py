@@ -183,8 +183,8 @@ def _mean(smoke_type: Any, rows: int, length: int) -> wp.Kernel:
             for y in range(y0, y1, wp.static(rows)):
                 row = float(0.0)
                 for z in range(z0, z1, wp.static(length)):
-                    if has_smoke(smoke.bricks, wp.vec3(float(x), float(y), float(z))):
-                        row += _covered(low[2], high[2], z) * voxel(field, smoke.cells, smoke.places, x, y, z)
+                    if has_smoke(smoke, wp.vec3(float(x), float(y), float(z))):
+                        row += _covered(low[2], high[2], z) * voxel(field, smoke, x, y, z)
                 plane += _covered(low[1], high[1], y) * row
             total += _covered(low[0], high[0], x) * plane
         total = lane_sum(total, wp.static(rows * length))
@@ -201,34 +201,25 @@ def mean(medium: Medium, field: wp.array, cell: wp.vec3, out: wp.array) -> None:
     _mean(medium, (*out.shape, rows * length), [field, cell], [out], rows, length)
 
 
-@wp.func
-def _overlap(cell: int, cells: int, fine: int, fines: int) -> float:
-    """Computes the share of a cell of a coarse grid that a cell of the finer grid covers, along one axis."""
-    each = float(fines) / float(cells)
-    low = wp.max(float(cell) * each, float(fine))
-    high = wp.min(float(cell + 1) * each, float(fine + 1))
-    return wp.max(high - low, 0.0) / each
-
-
 @wp.kernel
 def _coarsen(
     # in:
     fine: wp.array4d[float],
+    edges: wp.vec3,
     # out:
     out: wp.array4d[float],
 ):
+    """Averages over cells whose edges are 1 to 2 cells of the finer grid."""
     n, i, j, k = wp.tid()
-    nx = fine.shape[1]
-    ny = fine.shape[2]
-    nz = fine.shape[3]
+    low = wp.cw_mul(wp.vec3(float(i), float(j), float(k)), edges)
+    high = low + edges
     total = float(0.0)
-    for x in range((i * nx) / out.shape[1], wp.min(((i + 1) * nx - 1) / out.shape[1] + 1, nx)):
-        a = _overlap(i, out.shape[1], x, nx)
-        for y in range((j * ny) / out.shape[2], wp.min(((j + 1) * ny - 1) / out.shape[2] + 1, ny)):
-            b = a * _overlap(j, out.shape[2], y, ny)
-            for z in range((k * nz) / out.shape[3], wp.min(((k + 1) * nz - 1) / out.shape[3] + 1, nz)):
-                total += b * _overlap(k, out.shape[3], z, nz) * fine[n, x, y, z]
-    out[n, i, j, k] = total
+    for x in range(int(low[0]), wp.min(int(wp.ceil(high[0])), fine.shape[1])):
+        for y in range(int(low[1]), wp.min(int(wp.ceil(high[1])), fine.shape[2])):
+            share = _covered(low[0], high[0], x) * _covered(low[1], high[1], y)
+            for z in range(int(low[2]), wp.min(int(wp.ceil(high[2])), fine.shape[3])):
+                total += share * _covered(low[2], high[2], z) * fine[n, x, y, z]
+    out[n, i, j, k] = total / (edges[0] * edges[1] * edges[2])
 
 
 @wp.func
@@ -266,9 +257,10 @@ def spread(
         counts, edges = grids[-1][1].shape[1:], grids[-1][2]
         fewer = tuple((n + 1) // 2 for n in counts)
         made = [medium.buffer((count, *fewer), float) for count in (1, source.shape[0])]
+        times = wp.vec3(*(n / m for n, m in zip(counts, fewer, strict=True)))
         for fine, coarse in zip(grids[-1], made, strict=False):
-            wp.launch(_coarsen, coarse.shape, [fine], [coarse], device=device)
-        grids.append((*made, wp.vec3(*(edge * n / m for edge, n, m in zip(edges, counts, fewer, strict=True)))))
+            wp.launch(_coarsen, coarse.shape, [fine, times], [coarse], device=device)
+        grids.append((*made, wp.cw_mul(edges, times)))
     before = None
     for number, (thickness, stopped, edges) in reversed(list(enumerate(grids))):
         found = medium.buffer((light.shape[0], *stopped.shape[1:]), float) if number else light

@@ -76,8 +76,8 @@ def smoke_struct(dtype: Any, in_bricks: bool, stored: bool = False) -> Any:
 
 @dataclass(frozen=True)
 class Medium:
-    """Smoke on a device: density, float or half [X, Y, Z], and extinction per voxel at density 1; temperature in an
-    array like the density's, None for smoke without light, and light emitted per voxel at temperature 1.
+    """Smoke on a device: density, contiguous float or half [X, Y, Z], and extinction per voxel at density 1;
+    temperature in an array like it, None for smoke without light, and light emitted per voxel at temperature 1.
 
     `empty` allocates buffers on the density's device; None: Warp's own allocator. `bricks` tells which bricks of 8^3
     voxels contain smoke, a result of `occupied`; None: marches sample every voxel. With `places`, int [X / 8, Y / 8,
@@ -299,24 +299,36 @@ def _element(field: wp.array3d[wp.float32], i: int) -> float: ...
 def _element(field: wp.array3d[wp.float16], i: int) -> float: ...
 
 
-@wp.func_native("return (int)bricks.data[(i * bricks.shape[1] + j) * bricks.shape[2] + k];")
+_IN_BRICK = "return bricks.data[(i * bricks.shape[1] + j) * bricks.shape[2] + k];"
+
+
+@wp.func_native(_IN_BRICK)
 def _of_brick(bricks: wp.array3d[wp.uint8], i: int, j: int, k: int) -> int: ...
 
 
-@wp.func_native("return bricks.data[(i * bricks.shape[1] + j) * bricks.shape[2] + k];")
+@wp.func_native(_IN_BRICK)
 def _of_brick(bricks: wp.array3d[int], i: int, j: int, k: int) -> int: ...
 
 
 @wp.func
-def voxel(field: wp.array3d[Any], cells: wp.vec3i, places: int, i: int, j: int, k: int) -> float:
-    """Returns the density or the temperature of a voxel."""
-    return _element(field, (i * cells[1] + j) * cells[2] + k)
+def _of_brick(bricks: int, i: int, j: int, k: int) -> int:
+    return 1
 
 
 @wp.func
-def voxel(field: wp.array3d[Any], cells: wp.vec3i, places: wp.array3d[int], i: int, j: int, k: int) -> float:
-    place = _of_brick(places, i >> 3, j >> 3, k >> 3)
-    return _element(field, (place << 9) + ((i & 7) << 6) + ((j & 7) << 3) + (k & 7))
+def _place(places: int, cells: wp.vec3i, i: int, j: int, k: int) -> int:
+    return (i * cells[1] + j) * cells[2] + k
+
+
+@wp.func
+def _place(places: wp.array3d[int], cells: wp.vec3i, i: int, j: int, k: int) -> int:
+    return (_of_brick(places, i >> 3, j >> 3, k >> 3) << 9) + ((i & 7) << 6) + ((j & 7) << 3) + (k & 7)
+
+
+@wp.func
+def voxel(field: wp.array3d[Any], smoke: Any, i: int, j: int, k: int) -> float:
+    """Returns the density or the temperature of a voxel."""
+    return _element(field, _place(smoke.places, smoke.cells, i, j, k))
 
 
 @wp.struct
@@ -347,7 +359,7 @@ def _around(field: wp.array3d[Any], smoke: Any, p: wp.vec3) -> Corners:
         i = wp.where(n < 4, low[0], high[0])
         j = wp.where(n // 2 % 2 == 0, low[1], high[1])
         k = wp.where(n % 2 == 0, low[2], high[2])
-        c.values[n] = voxel(field, smoke.cells, smoke.places, i, j, k)
+        c.values[n] = voxel(field, smoke, i, j, k)
     return c
 
 
@@ -366,23 +378,18 @@ def density_at(field: wp.array3d[Any], smoke: Any, p: wp.vec3) -> float:
 
 
 @wp.func
-def has_smoke(bricks: wp.array3d[wp.uint8], p: wp.vec3) -> bool:
+def has_smoke(smoke: Any, p: wp.vec3) -> bool:
     """Tells whether there may be smoke at p, at most half a voxel outside the grid."""
-    i = wp.clamp(int(p[0]) >> 3, 0, bricks.shape[0] - 1)
-    j = wp.clamp(int(p[1]) >> 3, 0, bricks.shape[1] - 1)
-    k = wp.clamp(int(p[2]) >> 3, 0, bricks.shape[2] - 1)
-    return _of_brick(bricks, i, j, k) != 0
-
-
-@wp.func
-def has_smoke(bricks: int, p: wp.vec3) -> bool:
-    return True
+    i = wp.clamp(int(p[0]), 0, smoke.cells[0] - 1)
+    j = wp.clamp(int(p[1]), 0, smoke.cells[1] - 1)
+    k = wp.clamp(int(p[2]), 0, smoke.cells[2] - 1)
+    return _of_brick(smoke.bricks, i >> 3, j >> 3, k >> 3) != 0
 
 
 @wp.func
 def sample(smoke: Any, p: wp.vec3) -> float:
     """Interpolates density at p, at most half a voxel outside the grid; returns 0 at once in a brick known as empty."""
-    if has_smoke(smoke.bricks, p):
+    if has_smoke(smoke, p):
         return density_at(smoke.density, smoke, p)
     return 0.0
 
@@ -396,7 +403,7 @@ def sample(smoke: Any, p: wp.vec3) -> float:
     return nodes.data[n];
 #endif
 """)
-def node(nodes: wp.array3d[wp.vec2], i: int, j: int, k: int) -> wp.vec2: ...
+def _node(nodes: wp.array3d[wp.vec2], i: int, j: int, k: int) -> wp.vec2: ...
 
 
 @wp.func_native("""
@@ -410,13 +417,14 @@ def store_node(nodes: wp.array4d[wp.vec2], n: int, value: wp.vec2): ...
 
 
 @wp.func
-def node(nodes: wp.array3d[float], i: int, j: int, k: int) -> float:
+def _node(nodes: wp.array3d[Any], i: int, j: int, k: int):
     return nodes[i, j, k]
 
 
 @wp.func
-def node(nodes: wp.array3d[wp.vec3], i: int, j: int, k: int) -> wp.vec3:
-    return nodes[i, j, k]
+def node(nodes: wp.array3d[Any], i: int, j: int, k: int):
+    """Returns an element of an array, which must be contiguous for pairs; a GPU loads these at once."""
+    return _node(nodes, i, j, k)
 
 
 @wp.func
@@ -496,8 +504,8 @@ def begin_jittered(view: View, row: int, column: int, smoke: Any, march: MarchPa
 
 @wp.func
 def _two_may_have_smoke(r: Ray, smoke: Any) -> bool:
-    this = has_smoke(smoke.bricks, point_on(r, r.done, r.offset))
-    next = has_smoke(smoke.bricks, point_on(r, r.done + 1, r.offset))
+    this = has_smoke(smoke, point_on(r, r.done, r.offset))
+    next = has_smoke(smoke, point_on(r, r.done + 1, r.offset))
     return this or next
 
 
@@ -584,16 +592,6 @@ def nodes_along(shape: Sequence[int], step: float) -> tuple[int, ...]:
     return tuple(math.ceil((n + 1) / max(step, 1.0)) + 1 for n in shape)
 
 
-@wp.func
-def _is_stored(places: wp.array3d[int], a: int, b: int, c: int) -> bool:
-    return _of_brick(places, a, b, c) != 0
-
-
-@wp.func
-def _is_stored(places: int, a: int, b: int, c: int) -> bool:
-    return True
-
-
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
     for (int step = 16; step > 0; step /= 2)
@@ -625,7 +623,7 @@ def _mark(smoke_type: Any, lanes: int) -> wp.Kernel:
         the first ones along an axis (1) or of the last ones (2). A warp has a brick, a thread a voxel of each row."""
         a, b, c, lane = wp.tid()
         bits = int(0)
-        if _is_stored(smoke.places, a, b, c):
+        if _of_brick(smoke.places, a, b, c) != 0:
             for first in range(lane, wp.static(BRICK**3), wp.static(8 * lanes)):
                 values = _Eight()
                 for m in range(8):
@@ -634,7 +632,7 @@ def _mark(smoke_type: Any, lanes: int) -> wp.Kernel:
                     i = wp.min(BRICK * a + (n >> 6), smoke.cells[0] - 1)
                     j = wp.min(BRICK * b + ((n >> 3) & 7), smoke.cells[1] - 1)
                     k = wp.min(BRICK * c + (n & 7), smoke.cells[2] - 1)
-                    values[m] = voxel(smoke.density, smoke.cells, smoke.places, i, j, k)
+                    values[m] = voxel(smoke.density, smoke, i, j, k)
                 for m in range(8):
                     if values[m] > 0.0:
                         n = first + m * wp.static(lanes)
