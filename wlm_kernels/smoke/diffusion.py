@@ -16,6 +16,7 @@ import warp as wp
 
 from wlm_kernels.smoke.depth_lattice import Lattice, depths_at
 from wlm_kernels.smoke.march import (
+    BRICK,
     OPTIONS,
     MarchParameters,
     Medium,
@@ -169,24 +170,28 @@ def _mean(smoke_type: Any, rows: int, length: int) -> wp.Kernel:
         # out:
         out: wp.array3d[float],
     ):
+        """Averages a field over each cell. A warp has a cell; of each brick its threads have rows along z."""
         i, j, k, lane = wp.tid()
         low = wp.cw_mul(wp.vec3(float(i), float(j), float(k)), cell)
         high = low + cell
-        y0 = int(low[1]) + lane // wp.static(length)
-        z0 = int(low[2]) + lane % wp.static(length)
-        x1 = wp.min(int(wp.ceil(high[0])), smoke.cells[0])
-        y1 = wp.min(int(wp.ceil(high[1])), smoke.cells[1])
-        z1 = wp.min(int(wp.ceil(high[2])), smoke.cells[2])
+        first = wp.vec3i(int(low[0]), int(low[1]), int(low[2]))
+        end = wp.vec3i()
+        for a in range(3):
+            end[a] = wp.min(int(wp.ceil(high[a])), smoke.cells[a])
         total = float(0.0)
-        for x in range(int(low[0]), x1):
-            plane = float(0.0)
-            for y in range(y0, y1, wp.static(rows)):
-                row = float(0.0)
-                for z in range(z0, z1, wp.static(length)):
-                    if has_smoke(smoke, wp.vec3(float(x), float(y), float(z))):
-                        row += _covered(low[2], high[2], z) * voxel(field, smoke, x, y, z)
-                plane += _covered(low[1], high[1], y) * row
-            total += _covered(low[0], high[0], x) * plane
+        for a in range(first[0] // BRICK, (end[0] - 1) // BRICK + 1):
+            for b in range(first[1] // BRICK, (end[1] - 1) // BRICK + 1):
+                for c in range(first[2] // BRICK, (end[2] - 1) // BRICK + 1):
+                    if has_smoke(smoke, float(BRICK) * wp.vec3(float(a), float(b), float(c))):
+                        x0 = wp.max(BRICK * a, first[0])
+                        y0 = wp.max(BRICK * b, first[1]) + lane // wp.static(length)
+                        z0 = wp.max(BRICK * c, first[2]) + lane % wp.static(length)
+                        for z in range(z0, wp.min(BRICK * (c + 1), end[2]), wp.static(length)):
+                            for y in range(y0, wp.min(BRICK * (b + 1), end[1]), wp.static(rows)):
+                                row = float(0.0)
+                                for x in range(x0, wp.min(BRICK * (a + 1), end[0])):
+                                    row += _covered(low[0], high[0], x) * voxel(field, smoke, x, y, z)
+                                total += _covered(low[1], high[1], y) * _covered(low[2], high[2], z) * row
         total = lane_sum(total, wp.static(rows * length))
         if lane == 0:
             out[i, j, k] = total / (cell[0] * cell[1] * cell[2])

@@ -81,8 +81,8 @@ class Medium:
 
     `empty` allocates buffers on the density's device; None: Warp's own allocator. `bricks` tells which bricks of 8^3
     voxels contain smoke, a result of `occupied`; None: marches sample every voxel. With `places`, int [X / 8, Y / 8,
-    Z / 8], the numbers of bricks in `density` and `temperature`, these are [8 N, 8, 8], with 0 in brick 0, and `bricks`
-    must be given; None: all voxels are stored. `cells` are X, Y and Z; None: the density's. `solid` are obstacles in
+    Z / 8], the numbers of bricks in `density` and `temperature`, these are [8 N, 8, 8], with 0 in brick 0; None: all
+    voxels are stored. `cells` are X, Y and Z; None: the density's. `solid` are obstacles in
     the way of light and camera; None: there are none.
     """
 
@@ -605,9 +605,9 @@ def _of_any_lane(bits: int) -> int:
 
 
 @wp.func
-def _marks_of(n: int, shift: int) -> int:
-    """Returns the marks of a voxel along an axis: those of any voxel, and of the first or the last in a brick."""
-    return 1 | int(n == 0) << shift | int(n == BRICK - 1) << 2 * shift
+def _marks_of(some: bool, first: bool, last: bool, shift: int) -> int:
+    """Returns marks along an axis: whether there is some voxel, one of the first and one of the last of a brick."""
+    return int(some) | int(first) << shift | int(last) << 2 * shift
 
 
 @for_smoke
@@ -620,23 +620,20 @@ def _mark(smoke_type: Any, lanes: int) -> wp.Kernel:
         marks: wp.array3d[int],
     ):
         """Marks where in a brick there is smoke: bit 9 x + 3 y + z says whether in any voxel (x, y and z 0), in one of
-        the first ones along an axis (1) or of the last ones (2). A warp has a brick, a thread a voxel of each row."""
+        the first ones along an axis (1) or of the last ones (2). A warp has a brick, a thread two columns along x."""
         a, b, c, lane = wp.tid()
         bits = int(0)
         if _of_brick(smoke.places, a, b, c) != 0:
-            for first in range(lane, wp.static(BRICK**3), wp.static(8 * lanes)):
-                values = _Eight()
-                for m in range(8):
-                    n = first + m * wp.static(lanes)
-                    # Beyond the grid its last voxel is read again, which belongs to the same brick.
-                    i = wp.min(BRICK * a + (n >> 6), smoke.cells[0] - 1)
-                    j = wp.min(BRICK * b + ((n >> 3) & 7), smoke.cells[1] - 1)
-                    k = wp.min(BRICK * c + (n & 7), smoke.cells[2] - 1)
-                    values[m] = voxel(smoke.density, smoke, i, j, k)
-                for m in range(8):
-                    if values[m] > 0.0:
-                        n = first + m * wp.static(lanes)
-                        bits = bits | _marks_of(n & 7, 1) * _marks_of((n >> 3) & 7, 3) * _marks_of(n >> 6, 9)
+            for n in range(lane, BRICK * BRICK, wp.static(lanes)):
+                # Beyond the grid its last voxel is read again, which belongs to the same brick.
+                j = wp.min(BRICK * b + (n >> 3), smoke.cells[1] - 1)
+                k = wp.min(BRICK * c + (n & 7), smoke.cells[2] - 1)
+                column = _Eight()
+                for x in range(BRICK):
+                    column[x] = voxel(smoke.density, smoke, wp.min(BRICK * a + x, smoke.cells[0] - 1), j, k)
+                along = _marks_of(wp.max(column) > 0.0, column[0] > 0.0, column[BRICK - 1] > 0.0, 9)
+                y = _marks_of(True, n < 8, n >= BRICK * BRICK - BRICK, 3)
+                bits = bits | along * y * _marks_of(True, (n & 7) == 0, (n & 7) == BRICK - 1, 1)
         bits = _of_any_lane(bits)
         if lane == 0:
             marks[a, b, c] = bits
