@@ -45,11 +45,11 @@ FLOATS = (wp.float16, wp.float32)
 LATENTS = (1, 9, 12, 32)
 LATTICE_STEPS = (
     {"lattice": "D3Q19", "solids": True, "walls": (True, True, True)},
-    {"lattice": "D3Q19", "solids": True, "storage": "float16"},
+    {"lattice": "D3Q19", "solids": True, "storage": "float16", "group": 2},
     {"lattice": "D3Q19", "forced": True},
     {"lattice": "D3Q27", "solids": True, "forced": True},
     {"lattice": "D3Q27", "storage": "float16", "eddies": False},
-    {"lattice": "D3Q19", "solids": True, "storage": "float16", "in_place": True},
+    {"lattice": "D3Q19", "solids": True, "storage": "float16", "in_place": True, "group": 2},
     {"lattice": "D2Q9"},
 )
 
