@@ -31,7 +31,6 @@ BATCH_TEXELS = 64 * 26 * TILE * TILE
 CPU_TILES = 4
 """Largest number of tiles in a batch on a CPU: two cores gain nothing from more, and many cores want many batches."""
 
-_LOOK = 32  # tiles that are classified between two looks at the clock: some seconds
 _WORTHWHILE = 20_000_000  # samples that take two cores about 20 s: a process takes 3 s to start
 _FITTED = ("net", "uv", "uvt", "ut", "vt")  # arrays that a trainer returns
 _CONSTANT_ERROR = 0.01  # largest relative error of half floats of constant radiance; near 6e-8 they are further off
@@ -182,7 +181,7 @@ class _Facts:
 class SheetFit:
     """The tiles of a sheet to be fitted, by rising number, int [N], with their kinds, and the model that receives their
     maps and networks; those of batches that are not stored yet are still missing. `warning` is a setting that could not
-    be followed, or None.
+    be followed, or None; `whole_batches` is the number of dynamic tiles over that of the largest batch.
 
     Tiles are cut out of the sheet as they are needed, a few at a time: all tiles of a large set do not fit in memory.
     """
@@ -227,6 +226,8 @@ class SheetFit:
             **arrays,
         )
         self._dynamic = np.flatnonzero(self.kinds == TileKind.DYNAMIC)
+        self._largest = max(1, BATCH_TEXELS // (times * TILE * TILE))
+        self.whole_batches = len(self._dynamic) / self._largest
         for i, row in enumerate(self._dynamic):
             fact = facts[row]
             self.model.scale[i], self.model.peak[i], self.model.affine[i] = fact.scale, fact.peak, fact.affine
@@ -239,15 +240,6 @@ class SheetFit:
             self.model.frames[i], self.model.ranges[i] = encode_frames(tile.colour[0], tile.mask[0])
             if meter.due(i + 1):
                 meter.report(i + 1)
-
-    @property
-    def _largest(self) -> int:
-        return max(1, BATCH_TEXELS // (len(self.model.times) * TILE * TILE))
-
-    @property
-    def whole_batches(self) -> float:
-        """How many of the largest batches the dynamic tiles are."""
-        return len(self._dynamic) / self._largest
 
     def batches(self, first: int, share: float = 1.0, most: int | None = None) -> list[Batch]:
         """Splits the dynamic tiles into batches, numbered from `first`: equal ones of about a share of the largest
@@ -316,6 +308,6 @@ def _classify(
     facts: list[_Facts] = []
     for fact in each(look, numbers.tolist()):
         facts.append(fact)
-        if len(facts) % _LOOK == 0 and meter.due(len(facts)):
+        if meter.due(len(facts)):
             meter.report(len(facts))
     return facts
