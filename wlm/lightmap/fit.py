@@ -31,6 +31,7 @@ BATCH_TEXELS = 64 * 26 * TILE * TILE
 CPU_TILES = 4
 """Largest number of tiles in a batch on a CPU: two cores gain nothing from more, and many cores want many batches."""
 
+_LOOK = 32  # tiles that are classified between two looks at the clock: some seconds
 _WORTHWHILE = 20_000_000  # samples that take two cores about 20 s: a process takes 3 s to start
 _FITTED = ("net", "uv", "uvt", "ut", "vt")  # arrays that a trainer returns
 _CONSTANT_ERROR = 0.01  # largest relative error of half floats of constant radiance; near 6e-8 they are further off
@@ -308,6 +309,6 @@ def _classify(
     facts: list[_Facts] = []
     for fact in each(look, numbers.tolist()):
         facts.append(fact)
-        if meter.due(len(facts)):
+        if len(facts) % _LOOK == 0 and meter.due(len(facts)):
             meter.report(len(facts))
     return facts
