@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from builders.atlas_meshes import charts, sheet, triangle
 from builders.atlas_models import KINDS, MIXED, random_model, save_plainly, shared_model
-from builders.checks import assert_same, put
+from builders.checks import assert_same, error_of, put
 from builders.resigned import rewrite
 
 import wlm
@@ -148,8 +148,7 @@ def test_blocks_that_are_none_of_the_format(tmp_path):
     model = random_model(sheet(), "plain", "astc")
     save_plainly(model, tmp_path / "a.wlm")
     rewrite(tmp_path / "a.wlm", tensors={"colour": put((0, 7), 0)})  # a reserved mode
-    with pytest.raises(WlmError, match="a.wlm: astc: the block in row 1, column . is invalid"):
-        wlm.load(tmp_path / "a.wlm")
+    assert "a.wlm: astc: the block in row 1, column 1 is invalid" in error_of(wlm.load, tmp_path / "a.wlm")
 
 
 def test_a_texture_beyond_what_entries_reach(tmp_path):
@@ -160,8 +159,7 @@ def test_a_texture_beyond_what_entries_reach(tmp_path):
     assert not (tmp_path / "a.wlm").exists()
     save_plainly(model, tmp_path / "a.wlm")
     rewrite(tmp_path / "a.wlm", {"texels": [18, MOST_SIZE + 1]}, {"colour": wide.texels})
-    with pytest.raises(WlmError, match="at most 4096 texels along a side"):
-        wlm.load(tmp_path / "a.wlm")
+    assert "at most 4096 texels along a side" in error_of(wlm.load, tmp_path / "a.wlm")
 
 
 @pytest.mark.parametrize(

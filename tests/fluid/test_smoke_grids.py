@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from builders.checks import error_of
 from builders.nvdb_files import LEVEL_SET, nvdb_file, raw_grid
 from builders.vdb_files import ACTIVE_MASK, scaled, tree, vdb_file
 
@@ -125,8 +126,7 @@ def test_tiles_that_overlap(tmp_path: Path):
         tiles = [struct.pack("<3if?", 4096 + i * shift, 0, 0, 0.5, False) for i in range(2)]
         moved = nodes[:8] + struct.pack("<I", 2) + nodes[12:16] + b"".join(tiles) + nodes[16:]
         (tmp_path / "a.vdb").write_bytes(vdb_file({"density": (head, moved, ACTIVE_MASK, False)}))
-        with pytest.raises(WlmError, match="expected root nodes at different multiples of 4096"):
-            load_volume(tmp_path / "a.vdb")
+        assert "expected root nodes at different multiples of 4096" in error_of(load_volume, tmp_path / "a.vdb")
 
 
 @pytest.mark.parametrize(
@@ -160,11 +160,9 @@ def test_the_grid_of_the_smoke(heads: str, chosen: str | None):
         group = kind.replace("_", " ") if kind == "level_set" else ""
         found.append(GridHead(name, "float" if group or not kind else kind, group))
     if chosen is None:
-        reason = ".*coloured smoke is not read" if "vec3s" in heads else ""
-        with pytest.raises(
-            WlmError, match=f"a: expected a grid of floats named density, found {found[0].name}{reason}"
-        ):
-            choose("a", found)
+        said = error_of(choose, "a", found)
+        assert f"a: expected a grid of floats named density, found {found[0].name}" in said
+        assert ("coloured smoke is not read" in said) == ("vec3s" in heads)
         return
     density, _, warnings = choose("a", found)
     coloured = [
@@ -186,8 +184,7 @@ def test_level_sets(tmp_path: Path):
             path.write_bytes(data)
         else:
             path.write_bytes(vdb_file({"density" + "|level set|float" * (name == "a"): grid(ball, 3.0)}))
-        with pytest.raises(WlmError, match="level set"):
-            load_volume(path)
+        assert "level set" in error_of(load_volume, path)
         filled = load_volume(path, density="density")
         assert len(filled.warnings) == 1 and "filled with smoke of density 1" in filled.warnings[0]
         np.testing.assert_allclose(filled.density, np.clip(-ball / 3, 0, 1), atol=1e-6)
@@ -295,10 +292,9 @@ def test_one_grid_for_a_sequence(tmp_path: Path):
     write(tmp_path / "s_0001.vdb", "smoke")
     assert not load_frames(tmp_path, up="y").load(1).density.any()
     assert load_frames(tmp_path, up="y", density="smoke").load(1).density.any()
-    with pytest.raises(
-        WlmError, match="fog: expected the name of one of the file's grids of floats, found smoke, flame, density"
-    ):
-        load_frames(tmp_path, density="fog")
+    assert "fog: expected the name of one of the file's grids of floats, found smoke, flame, density" in error_of(
+        load_frames, tmp_path, density="fog"
+    )
 
 
 @pytest.mark.parametrize(
@@ -322,8 +318,7 @@ def test_names_of_frames(tmp_path: Path, names: list[str], numbers: tuple[int, .
     for name in names:
         write(tmp_path / f"{name}.vdb", "density", values=smoke((8, 8, 8)))
     if numbers is None:
-        with pytest.raises(WlmError, match="expected frames of simulate, or one sequence of volumes"):
-            load_frames(tmp_path)
+        assert "expected frames of simulate, or one sequence of volumes" in error_of(load_frames, tmp_path)
         return
     frames = load_frames(tmp_path)
     assert frames.numbers == numbers

@@ -1,5 +1,6 @@
 import errno
 import os
+import re
 from pathlib import Path
 
 import numpy as np
@@ -67,10 +68,8 @@ def test_a_device_is_not_replaced():
 
 def test_a_folder_or_a_missing_folder_is_refused(tmp_path, target):
     assert "expected a file or none, found" in error_of(atomic_write, tmp_path, b"x")
-    with pytest.raises(WlmError, match="the folder .*none does not exist"):
-        atomic_write(tmp_path / "none" / "f", b"x")
-    with pytest.raises(WlmError, match="the folder .*file.bin does not exist"):
-        atomic_write(target / "f", b"x")
+    assert re.search("the folder .*none does not exist", error_of(atomic_write, tmp_path / "none" / "f", b"x"))
+    assert re.search("the folder .*file.bin does not exist", error_of(atomic_write, target / "f", b"x"))
     _assert_untouched(target)
 
 

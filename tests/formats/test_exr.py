@@ -1,4 +1,5 @@
 import os
+import re
 import resource
 from pathlib import Path
 
@@ -225,8 +226,7 @@ def test_integers_and_several_parts_are_refused(tmp_path, read):
     assert "channel G: expected half or float numbers, found uint32" in error_of(read, path)
     parts = [OpenEXR.Part({}, planes, name=name) for name in ("one", "two")]
     OpenEXR.File(parts).write(str(path))
-    with pytest.raises(WlmError, match="expected (an EXR file of one part|one layer of colour), found"):
-        read(path)
+    assert re.search("expected (an EXR file of one part|one layer of colour), found", error_of(read, path))
 
 
 @READERS
@@ -236,8 +236,7 @@ def test_a_missing_file_or_other_content_is_refused(tmp_path, capfd, read):
     assert "found a folder" in error_of(read, tmp_path)
     for content in (b"", b"\x76\x2f", b"\x89PNG" + b"x" * 500):
         path.write_bytes(content)
-        with pytest.raises(WlmError, match="a.exr: expected an EXR file, found other content$"):
-            read(path)
+        assert re.search("a.exr: expected an EXR file, found other content$", error_of(read, path))
     path.write_bytes(b"\x76\x2f\x31\x01" + b"x" * 500)
     assert "cut short or damaged" in error_of(read, path)
     assert capfd.readouterr() == ("", "")

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from builders.checks import error_of
 from builders.exported import read_export
 from builders.probe_models import EXTENT, ORIGIN, SIZE, random_model, with_content
 from builders.probe_sets import synthetic
@@ -167,9 +168,7 @@ def test_what_cannot_be_exported(tmp_path):
     for extent in (1e39, 1e-60):
         with pytest.raises(WlmError, match="random: cannot export: the probes' box is too"):
             export(replace(model, extent=extent), tmp_path / "new")
-    with pytest.raises(WlmError, match="device 'tpu'"):
-        export(model, tmp_path / "new", device="tpu")
+    assert "device 'tpu'" in error_of(export, model, tmp_path / "new", device="tpu")
     assert not (tmp_path / "new").exists()
     (tmp_path / "file").write_text("x")
-    with pytest.raises(WlmError, match="cannot write there"):
-        export(model, tmp_path / "file")
+    assert "cannot write there" in error_of(export, model, tmp_path / "file")

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from builders import day_scenes
+from builders.checks import error_of
 from builders.gltf_maker import GltfMaker
 
 import wlm
@@ -95,8 +96,7 @@ def test_one_line_names_the_key(room, old, new, line):
 
 
 def test_probes_are_needed_by_what_they_light(room):
-    with pytest.raises(WlmError, match="probes: expected a file of probes"):
-        wlm.scene.load(edited(room, "probes: probes.wlm\n", ""))
+    assert "probes: expected a file of probes" in error_of(wlm.scene.load, edited(room, "probes: probes.wlm\n", ""))
 
 
 def test_inspect_describes_the_scene_and_names_the_command(room):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from builders import day_scenes
+from builders.checks import error_of
 from PIL import Image
 from scipy.ndimage import maximum_filter, minimum_filter
 
@@ -137,10 +138,9 @@ def test_a_camera_may_pass_above_its_target(changed):
 
 def test_the_smoke_of_a_folder_has_a_bound(scene, monkeypatch):
     monkeypatch.setattr(frame_module, "_SMOKE_BYTES", 2 * 8 * 8 * 8 * 2 - 1)
-    with pytest.raises(
-        WlmError, match="smoke: expected at most 0 MiB of six-way lightmaps, found 2 frames of 1024 bytes"
-    ):
-        Renderer(scene, 9, 16)
+    assert "smoke: expected at most 0 MiB of six-way lightmaps, found 2 frames of 1024 bytes" in error_of(
+        Renderer, scene, 9, 16
+    )
 
 
 def test_an_original_is_shown_instead(renderer, scene):

@@ -2,6 +2,7 @@
 
 import csv
 import math
+import re
 from dataclasses import replace
 from unittest import mock
 
@@ -172,8 +173,7 @@ def test_the_best_network_is_kept(tmp_path):
         return _train(tmp_path / "a", profile, make_pool=_worse, progress=report)
 
     # It ends far below where it began, and the best stays.
-    with pytest.raises(WlmError, match=r"diverged: .* dB after 24 steps, .* before the first; .* rate below 0.01"):
-        run(1e-2)
+    assert re.search(r"diverged: .* dB after 24 steps, .* before the first; .* rate below 0.01", error_of(run, 1e-2))
     assert wlm.load(tmp_path / "a").summary["psnr"] == max(scores)
     scores.clear()
     training = run(1e-3)
@@ -348,8 +348,7 @@ def test_a_profile_is_overridden_part_by_part():
         ({"training": {"stps": 7}}, "unknown key 'training.stps'; did you mean 'steps'"),
         ({"network": {"guide": "paper"}}, "dataset.guide: expected paper"),
     ):
-        with pytest.raises(WlmError, match=message):
-            fast.override(wrong)
+        assert re.search(message, error_of(fast.override, wrong))
 
 
 @pytest.mark.parametrize(

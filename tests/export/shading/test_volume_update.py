@@ -4,12 +4,12 @@ import re
 
 import numpy as np
 import pytest
+from builders.checks import error_of
 from builders.probe_models import random_model
 from builders.shader_runs import compiled, device, gl
 
 from wlm import probe
 from wlm.bundle import Bundle
-from wlm.errors import WlmError
 from wlm.export.shading import translate
 from wlm.probe.volume.cascade import Volume
 from wlm.probe.volume.update import update_bundle
@@ -179,8 +179,6 @@ def test_update_of_nothing_and_of_a_volume_with_light():
     model, place = _random()
     volume = _volume(model, place)
     volume.update(place[0])
-    with pytest.raises(WlmError, match="has not been updated"):
-        update_bundle(volume, model)
+    assert "has not been updated" in error_of(update_bundle, volume, model)
     nothing = Volume(place, volume.light, live=np.zeros(len(place), bool))
-    with pytest.raises(WlmError, match="no probe is live"):
-        update_bundle(nothing, model)
+    assert "no probe is live" in error_of(update_bundle, nothing, model)
