@@ -138,9 +138,8 @@ def test_each_call_of_a_step_graph_is_one_step(device, warmup):
 
 def test_each_call_of_a_launch_graph_is_one_step(device):
     amount, total = (wp.full(8, float(value), dtype=float, device=device) for value in (2, 0))
-    graph = LaunchGraph(
-        lambda: wp.launch(_add, dim=8, inputs=[amount], outputs=[total], device=device), device, warmup=2
-    )
+    add = partial(wp.launch, _add, dim=8, inputs=[amount], outputs=[total], device=device)
+    graph = LaunchGraph(add, device, warmup=2)
     for count in range(1, 8):
         graph()
         assert (total.numpy() == 2 * count).all()

@@ -142,9 +142,7 @@ def test_blocks_that_are_none_of_the_format(tmp_path):
     beyond = {"lut": put((0, 0), pack_entries(np.array([16, 4]), np.array([8, 4]), True))}
     _refused(tmp_path, MIXED, "beyond the colour texture", tensors=beyond)
     blocks = {"colour": lambda v: np.zeros((1, 29, 16), np.uint8)}
-    _refused(
-        tmp_path, "plain", "colour is uint8 .1, 29, 16., expected uint8 .1, 30, 16.", tensors=blocks, stored="astc"
-    )
+    _refused(tmp_path, "plain", "colour is uint8 .1, 29, 16., expected uint8 .1, 30, 16", tensors=blocks, stored="astc")
     model = random_model(sheet(), "plain", "astc")
     save_plainly(model, tmp_path / "a.wlm")
     rewrite(tmp_path / "a.wlm", tensors={"colour": put((0, 7), 0)})  # a reserved mode
@@ -167,11 +165,7 @@ def test_a_texture_beyond_what_entries_reach(tmp_path):
     [
         ("lut", put((0, 0), np.array([36 << 4 | 7, 0, 0, 1])), "beyond the colour texture"),
         ("lut", put((0, 0), np.array([0, 0, 7, 1])), "names a factor beyond the last one"),
-        (
-            "lut",
-            put((0, 0), np.array([0, 0, 0, 1 << 8 | 1])),
-            "more coarse components, of one block each, than components",
-        ),
+        ("lut", put((0, 0), np.array([0, 0, 0, 1 << 8 | 1])), "more coarse components, of one block each, than"),
         ("lut", lambda v: np.ascontiguousarray(v[..., :3]), "expected entries of 2 or 4 numbers"),
         ("sheets", put((0, 0), 999), "expected the height and width in setting sizes"),
         ("sheets", put((0, 4), 3), "expected as many tiles as"),

@@ -104,9 +104,7 @@ def test_pictures_inside_the_file(tmp_path):
         assert_lit(inside, atol=atol)
         assert any(PNG_8 in line for line in inside.warnings) == (data[:4] == b"\x89PNG")
         maker = GltfMaker()
-        maker.content |= {
-            key: value for key, value in content.items() if key not in ("accessors", "bufferViews", "buffers")
-        }
+        maker.content |= {key: content[key] for key in content.keys() - {"accessors", "bufferViews", "buffers"}}
         attributes = {"POSITION": maker.add(np.float32(POSITION)), "TEXCOORD_1": maker.add(np.float32(UV))}
         corners = maker.add(np.uint32(TRIANGLE).reshape(-1))
         maker.content["meshes"] = [{"primitives": [{"attributes": attributes, "indices": corners, "material": 0}]}]
@@ -205,9 +203,7 @@ def test_lightmaps_that_are_named_and_cannot_be_read(tmp_path):
     with changed(path) as content:
         content["nodes"][0]["extensions"]["NEEDLE_components"]["builtin_components"][0]["lightmapIndex"] = 65535
     assert "NEEDLE_lightmaps: no mesh of the scene has such" in error_of(load, path)
-    assert "its extension ABC_lightmap is not known" in error_of(
-        load, scene(tmp_path, {}, extensionsUsed=["ABC_lightmap"])
-    )
+    assert "its extension A_lightmap is not known" in error_of(load, scene(tmp_path, {}, extensionsUsed=["A_lightmap"]))
     assert "texCoord" not in error_of(load, scene(tmp_path, moz(index=3))) and "textures[3]" in error_of(
         load, tmp_path / "a.gltf"
     )

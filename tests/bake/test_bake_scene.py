@@ -276,3 +276,27 @@ def test_a_textures_place_is_read(tmp_path):
 def test_what_is_no_picture_is_refused_without_pythons_words(tmp_path):
     with pytest.raises(WlmError, match=r"textures\[0\]: expected a PNG, JPEG or WebP image$"):
         read_geometry(textured(tmp_path, {}, b"not a picture"), None)
+
+
+BAKED = ROOM.parent / "data" / "cornell"
+
+
+def test_lightmaps_are_of_the_scenes_hours():
+    scene = open_task(ROOM / "room.yaml").scene
+    lightmaps = load(BAKED).light
+    assert lightmaps.times.tolist() == list(scene.hours) and lightmaps.period == scene.period
+    assert lightmaps.mask.shape == (scene.lightmap.resolution, scene.lightmap.resolution)
+    means = (float(frame[lightmaps.mask].mean()) for frame in lightmaps.frames)
+    light = dict(zip(scene.hours, means, strict=True))
+    # The sun is low in the window at eight, and has left it at noon; at 20 h the lamp is lit.
+    assert light[8] > 3 * light[12] and light[20] > 3 * light[17]
+
+
+def test_probes_are_where_the_scene_has_them():
+    task = open_task(ROOM / "room.yaml")
+    scene, path = task.scene, task.geometry
+    places = place_probes(scene.probes, read_geometry(path, None))
+    for hour in scene.hours:
+        probes = load_probes(BAKED / "probes.npz", key=f"{hour:g}h")
+        np.testing.assert_allclose(probes.position, places, atol=1e-6)
+        assert probes.live.any()

@@ -101,11 +101,7 @@ def test_air(kind: str, device: str):
     random = np.random.default_rng(2)
     shape = lattice.shape
     # Populations of solid cells have no gradients, but those there that faces and solids return have.
-    weight_u, weight_rho, weight_drag = (
-        random.normal(size=(*shape, 3)),
-        random.normal(size=shape),
-        random.normal(size=3),
-    )
+    weight_u, weight_rho, weight_drag = (random.normal(size=size) for size in ((*shape, 3), shape, 3))
     plane = np.array([1.0, 1.0, 0.0 if shape[2] == 1 else 1.0])
     start = air.populations().requires_grad_()
     inlet = _tensor(0.06 * plane * random.uniform(-0.2, 1.0, (STEPS, 1, 3)), device)
@@ -120,9 +116,8 @@ def test_air(kind: str, device: str):
 
     out = air.advance(start, STEPS, inlet=inlet, force=force, begin=0, states=5)
     rho, u = air.fields(out, force)
-    w_u, w_rho, w_drag = (
-        torch.tensor(w, dtype=torch.float32, device=device) for w in (weight_u, weight_rho, weight_drag)
-    )
+    weights = (weight_u, weight_rho, weight_drag)
+    w_u, w_rho, w_drag = (torch.tensor(w, dtype=torch.float32, device=device) for w in weights)
     loss = (w_u * u).sum() + (w_rho * rho).sum() + (w_drag * air.force_on_solid(out)).sum()
     _hold(loss, [start, inlet, force], value)
     # A uniform velocity and one for each cell are the same.

@@ -353,9 +353,7 @@ def _ring(inner: float, outer: float, centre, sides: int = 96) -> Mesh:
     return Mesh(Trajectory.of(centre), np.array(corners, np.float32), np.array(triangles))
 
 
-@pytest.mark.parametrize(
-    ("radius", "storage", "most"), [(8, "float32", 0.03), (8, "float16", 0.03), (16, "float32", 0.012)]
-)
+@pytest.mark.parametrize("radius, storage, most", [(8, "float32", 0.03), (8, "float16", 0.03), (16, "float32", 0.012)])
 def test_a_cylinder_turns_in_another(radius: int, storage: str, most: float, device: str):
     """Taylor and Couette between a turning cylinder and one at rest of twice the radius: the exact profile of the
     tangential velocity, as the RMS error over the speed of the wall."""

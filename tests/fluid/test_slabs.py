@@ -109,9 +109,7 @@ def test_outlets_of_all_slabs_conserve_mass(storage: str, device: str):
     one, several = (_tunnel(names, outlet=None, storage=storage) for names in (device, [device] * 3))
     for lattice in (one, several):
         lattice.step(60)
-    fields = [
-        np.dstack([lattice.density(), lattice.velocity().numpy().reshape(*SHAPE[:2], -1)]) for lattice in (one, several)
-    ]
+    fields = [np.dstack([each.density(), each.velocity().numpy().reshape(*SHAPE[:2], -1)]) for each in (one, several)]
     np.testing.assert_allclose(*fields, atol=1e-6 if storage == "float32" else 2e-4)
     assert abs(several.mass() / np.prod(SHAPE) - 1.0) < (1e-6 if storage == "float32" else 1e-3)
 

@@ -141,9 +141,7 @@ def test_nvdb_of_two_grids(tmp_path: Path):
     by_name = load_volume(tmp_path / "both.nvdb", density="temperature")
     np.testing.assert_array_equal(by_name.density, hot)
     assert by_name.temperature is None
-    with pytest.raises(
-        WlmError, match="both.nvdb: heat: expected the name of one of .* floats, found temperature .*, density"
-    ):
+    with pytest.raises(WlmError, match="both.nvdb: heat: expected the name of one of .* floats, found temperature"):
         load_volume(tmp_path / "both.nvdb", temperature="heat")
     # Each in a segment of its own, as converters append them; and the temperature in finer voxels, further on.
     finer = raw_grid(np.ones_like(hot), name="temperature", voxel=0.25, origin=(2.875, 2, 3))
@@ -346,15 +344,11 @@ def test_damage(tmp_path: Path):
     path.write_bytes(whole.replace(b"ScaleMap", b"OtherMap"))
     assert "a.vdb: density: expected a linear transform, found a OtherMap" in error_of(load_volume, path)
     path.write_bytes(whole.replace(b"Tree_float_5_4_3", b"Tree_vec3s_5_4_3"))
-    assert "a.vdb: expected a grid of floats named density, found density (vec3s): coloured smoke" in error_of(
-        load_volume, path
-    )
+    assert "a.vdb: expected a grid of floats named density, found density (vec3s): col" in error_of(load_volume, path)
     nodes = tree(*smoke(), 0)
     both = vdb_file({name: (scaled(1, 1, 1), nodes, 0, False) for name in ("density", "heat")})
     path.write_bytes(both.replace(b"Tree_float_5_4_3", b"Tree_vec3s_5_4_3", 1))
-    assert "a.vdb: expected a grid of floats named density, found density (vec3s), heat: coloured" in error_of(
-        load_volume, path
-    )
+    assert "a grid of floats named density, found density (vec3s), heat: coloured" in error_of(load_volume, path)
     assert load_volume(path, density="heat").shape == (24, 16, 32)
     write(path, placed=scaled(1, 1, 1e-7))
     assert "a.vdb: density: expected at most 16777216 cubic voxels" in error_of(load_volume, path)

@@ -64,11 +64,7 @@ TEXELS = np.arange(15 + 2 + 1, dtype="<u4").tobytes()  # 5x3, 2x1, 1x1
             {FLAGS: 0x881007, PITCH: 96, DEPTH: 5, CAPS: 0x1008, CAPS2: 0x200000, DIMENSION: 4},
         ),
         # DDSD_PITCH and the bytes of a row take the place of DDSD_LINEARSIZE and those of the texture.
-        (
-            bytes(range(30)),
-            {"width": 3, "height": 5, "fmt": "R8G8_UNORM"},
-            {FLAGS: 0x100F, PITCH: 6, FORMAT: 49, DIMENSION: 3},
-        ),
+        (bytes(range(30)), {"width": 3, "height": 5, "fmt": "R8G8_UNORM"}, {PITCH: 6, FORMAT: 49, DIMENSION: 3}),
         # DDSCAPS_COMPLEX, and the size of an array.
         (
             _blocks(6),

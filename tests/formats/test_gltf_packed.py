@@ -74,10 +74,8 @@ def draco_file(folder, cut=0, **changes):
         {"componentType": 5123, "count": TRIANGLE.size, "type": "SCALAR"},
     ]
     maker.content["accessors"][0] |= changes
-    packed = {
-        "bufferView": maker.view(data[: len(data) - cut]),
-        "attributes": {name: ids[kinds[name]] for name in kinds},
-    }
+    attributes = {name: ids[kinds[name]] for name in kinds}
+    packed = {"bufferView": maker.view(data[: len(data) - cut]), "attributes": attributes}
     primitive = {"attributes": {"POSITION": 0, "TEXCOORD_0": 1}, "indices": 2, "extensions": {DRACO: packed}}
     return scene(maker, primitive, DRACO).save(folder / "a.glb")
 

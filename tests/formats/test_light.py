@@ -162,10 +162,7 @@ def test_kinds_are_told_by_content(tmp_path):
     for content, found in (
         (b"", "an empty file"),
         (b"no lightmap", "other content"),
-        (
-            b"\x89PNG\r\n\x1a\n",
-            "a PNG: state what light its numbers stand for with --encoding (linear, srgb, rgbm, ...)",
-        ),
+        (b"\x89PNG\r\n\x1a\n", "a PNG: state what light its numbers stand for with --encoding (linear, srgb, rgbm"),
         (b"\xabKTX 11\xbb\r\n\x1a\n", "a KTX file of version 1"),
     ):
         (tmp_path / "a.exr").write_bytes(content)

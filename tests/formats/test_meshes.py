@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 import trimesh
 from builders.checks import error_of
+from builders.gltf_scene import box
 
+from wlm.formats.geometry import Geometry
 from wlm.formats.meshes import MeshArrays, read_mesh
 
 SQUARE = """# a square
@@ -119,3 +121,19 @@ def test_many_corners_and_materials_are_refused_before_they_are_read(tmp_path):
 def test_a_missing_file_and_another_format(tmp_path):
     assert "No such file" in error_of(read_mesh, tmp_path / "a.obj")
     assert "expected a mesh file" in error_of(read_mesh, tmp_path / "a.fbx")
+
+
+@pytest.mark.parametrize("size", [1.0, 1e-20, 1e18])
+def test_a_room_faces_its_middle(size):
+    position, triangle, uv = box((-1, -1, -1), (1, 1, 1))
+    position = (np.array([5.0, -2.0, 0.5]) + position * [1.0, 2.0, 0.5]) * size
+    walls, outside = (Geometry(position.astype(np.float32), faces, uv) for faces in (triangle[:, ::-1], triangle))
+    assert walls.is_room and not outside.is_room
+    mixed = np.concatenate([walls.triangle[:6], outside.triangle[6:]])
+    assert not Geometry(walls.position, mixed, uv).is_room
+
+
+def test_a_plane_and_nothing_are_no_rooms():
+    position, triangle, uv = box((-1, -1, -1), (1, 1, 1))
+    assert not Geometry((position * [1, 0, 1]).astype(np.float32), triangle[:, ::-1], uv).is_room
+    assert not Geometry(position.astype(np.float32), np.zeros((0, 3), np.uint32), uv).is_room

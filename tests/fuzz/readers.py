@@ -280,10 +280,8 @@ def _tiles(draw: Random, data: bytes) -> bytes:
     node = tree(values, np.ones(values.shape, bool), ACTIVE_MASK)[
         28:
     ]  # of tiles, without the root's head and its place
-    nodes, tiles = (
-        draw.choice(((1, 0), (2, 0), (1, 40), (6, 3), (0, 2000))),
-        (0, 8, -8, 1, 100, 4095, 4096, -4096, 1 << 20),
-    )
+    nodes = draw.choice(((1, 0), (2, 0), (1, 40), (6, 3), (0, 2000)))
+    tiles = (0, 8, -8, 1, 100, 4095, 4096, -4096, 1 << 20)
     root = struct.pack("<If2I", 1, draw.choice((0.0, 1.0, -1.0)), nodes[1], nodes[0])
     for _ in range(nodes[1]):
         root += struct.pack("<3if?", *draw.choices(tiles, k=3), draw.choice((0.0, 0.5, 1e30)), draw.random() < 0.9)

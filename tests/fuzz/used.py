@@ -28,17 +28,7 @@ from wlm.formats.exr import write_exr
 from .reader import CORPUS, FILES, Reader, check_finite
 
 MESHES = ("mesh.glb", "mesh.gltf", "mesh.obj", "atlas.glb")
-LIGHTS = (
-    "light.exr",
-    "tiled.exr",
-    "wide.exr",
-    "plain.hdr",
-    "light.pfm",
-    "bc6h.dds",
-    "half-mips.ktx2",
-    "nan.exr",
-    "layers.exr",
-)
+LIGHTS = "light.exr tiled.exr wide.exr plain.hdr light.pfm bc6h.dds half-mips.ktx2 nan.exr layers.exr".split()
 LEVELS = ("mask-rgba.png", "mask-grey.png", "levels.jpg", "flipbook.tga", "strips.tif")
 LIGHTMAPS = ("lightmap.wlm", "lightmap-frames.wlm", "lightmap-layers.wlm")
 ATLASES = tuple(f"atlas-{kind}.wlm" for kind in ("tiles", "mixed", "cascade", "bc6h", "plain", "shared", "separate"))
@@ -49,19 +39,7 @@ SETS = ("set", "alpha", "mixed", "gone")
 VOLUMES = ("volume.npz", "volume-bricks.npz", "openvdb.vdb", "huge.npz")
 BOOKS = ("flipbook.png", "flipbook.tga", "mask-rgba.png", "mask-grey.png", "large.png", "six-way.exr", "light.exr")
 LISTS = tuple(f"list-{i}.json" for i in range(4))
-ENCODINGS = (
-    "linear",
-    "srgb",
-    "rgbm",
-    "rgbm:1e-30:9",
-    "rgbm:99999:8",
-    "rgbd",
-    "rgbd:1:1",
-    "dldr",
-    "rgbe",
-    "layer:View.Bake",
-    "x",
-)
+ENCODINGS = "linear srgb rgbm rgbm:1e-30:9 rgbm:99999:8 rgbd rgbd:1:1 dldr rgbe layer:View.Bake x".split()
 QUICK = ("--views", "1", "--resolution", "16")
 TIMES = ("18.5", "-5", "1e300", "nan", "25.5")
 LAYOUTS = ("unity", "o3de", "embergen")

@@ -159,9 +159,8 @@ def fused_step(trainer: Trainer, quantised: bool) -> Step:
     with interop.stream(trainer.device):
         trainer._round()
         trainer._add_gradients(int(quantised))
-        flat, hidden, output = (
-            values.sum(0).cpu().numpy() for values in (trainer._acc, trainer._partial, trainer._partial_out)
-        )
+        sums = (trainer._acc, trainer._partial, trainer._partial_out)
+        flat, hidden, output = (values.sum(0).cpu().numpy() for values in sums)
         trainer._update(int(quantised))
     flat = flat if trainer.device == "cpu" else (flat * 2.0**-40).astype(np.float32)
     grads, at = {}, 0

@@ -74,9 +74,8 @@ def _members(*built: object) -> list:
 def _probe_network(shape: tuple[int, int, int]) -> list:
     latent, hidden, outputs = shape
     decoder = probe_decode.decode_kernels(latent, hidden, outputs, True, 3, "cuda")
-    return _members(
-        probe_network.network_kernels(latent, hidden, outputs + 1, "cuda"), decoder, *decoder._kernels.values()
-    )
+    network = probe_network.network_kernels(latent, hidden, outputs + 1, "cuda")
+    return _members(network, decoder, *decoder._kernels.values())
 
 
 def _smoke(dtype: type) -> list:

@@ -30,9 +30,8 @@ def test_gather_clears_clamps_and_counts(device: str):
         before = fit.maps.clone()
         grads = fused_step(fit, False).grads
         share = _share(min(step, 11), 12, 0.1)  # beyond the last step its rate stays
-        np.testing.assert_allclose(
-            fit._rates[:2].cpu().numpy(), [0.02 * share, 0.005 * share], rtol=1e-5, err_msg=f"step {step}"
-        )
+        want = [0.02 * share, 0.005 * share]
+        np.testing.assert_allclose(fit._rates[:2].cpu().numpy(), want, rtol=1e-5, err_msg=f"step {step}")
         # Adam moves a value by hardly more than its rate, from where gather has put it.
         moved = (fit.maps - before.clamp(0.0, 1.0)).abs()
         assert float(moved.max()) < 0.02 * share * 4.0

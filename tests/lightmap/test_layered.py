@@ -117,9 +117,8 @@ def test_scores_are_relative_to_the_encodings_range(fitted, tmp_path):
     decoder, original = model.decoder(), turning_directions(hours=hours)
     light, directions, _ = report.sheets.values()
     # Of values in [-1, 1]: the peak is 2, wherever the tile's own values are.
-    expected = [
-        10 * np.log10(4.0 / np.square(decoder.frame(h, "dir") - o).mean()) for h, o in zip(hours, original, strict=True)
-    ]
+    pairs = zip(hours, original, strict=True)
+    expected = [10 * np.log10(4.0 / np.square(decoder.frame(h, "dir") - o).mean()) for h, o in pairs]
     np.testing.assert_allclose(directions.psnr_by_time, expected, atol=1e-3)
     worst = max(np.abs(decoder.frame(h, "dir") - o).max() for h, o in zip(hours, original, strict=True))
     assert directions.max_abs_error == pytest.approx(worst, rel=1e-4)

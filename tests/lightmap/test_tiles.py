@@ -121,10 +121,8 @@ def test_only_valid_texels_count():
     linear, mask = np.full((2, TILE, TILE, 3), 0.5, np.float32), np.ones((TILE, TILE), bool)
     mask[7] = False
     linear[0, 7] = 4.0
-    kinds = [
-        SheetFit(from_arrays(linear, [0, 1], valid), Profile(name="", frames="never")).kinds[0]
-        for valid in (mask, None)
-    ]
+    lightmaps = [from_arrays(linear, [0, 1], valid) for valid in (mask, None)]
+    kinds = [SheetFit(each, Profile(name="", frames="never")).kinds[0] for each in lightmaps]
     assert kinds == [TileKind.CONSTANT, TileKind.DYNAMIC]
 
 

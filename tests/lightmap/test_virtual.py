@@ -143,10 +143,8 @@ def test_mips_are_means_of_all_texels(time, device):
 
 
 def test_values_that_are_not_light_have_their_own_gamma(device):
-    sheets = {
-        LIGHT: random_sheet((3, 3)),
-        Sheet("0", "dir", encoding="signed"): random_sheet((3, 4), gamma=1.0, seed=1),
-    }
+    directions = random_sheet((3, 4), gamma=1.0, seed=1)
+    sheets = {LIGHT: random_sheet((3, 3)), Sheet("0", "dir", encoding="signed"): directions}
     model = LightmapModel("two", "0123456789abcdef", sheets[LIGHT].profile, sheets)
     with VirtualTexture(model, device, **SMALL, decodes=64) as virtual:
         for s, own in enumerate(sheets.values()):

@@ -160,9 +160,8 @@ def test_layers_and_arrays_without_a_gradient(device: str):
     grads = _on_tape(_layers, (60,), arguments, result, normal(60, seed=20))
     assert [*grads] == ["values"]
     leaf = torch.tensor(values[..., None], device=device).requires_grad_()
-    sampled = ops.plane(
-        leaf, torch.tensor(points, device=device), layer=torch.tensor(layer, device=device), periodic=True
-    )
+    points, layer = torch.tensor(points, device=device), torch.tensor(layer, device=device)
+    sampled = ops.plane(leaf, points, layer=layer, periodic=True)
     sampled[:, 0].backward(torch.tensor(normal(60, seed=20), device=device))
     close(result, sampled[:, 0], 1e-6)
     close(grads["values"], leaf.grad[..., 0], 1e-5)

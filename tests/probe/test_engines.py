@@ -259,9 +259,8 @@ def test_axes_turn_the_light_with_the_scene(axes, tmp_path):
     assert loaded.source != wlm.probe.load(tmp_path / "a.npz").source
     np.testing.assert_allclose(loaded.position @ matrix, position)
     want = irradiance(values.reshape(20, 9, 3), normals)
-    np.testing.assert_allclose(
-        irradiance(loaded.values.reshape(20, 9, 3), normals @ matrix.T), want, rtol=1e-4, atol=1e-5
-    )
+    seen = irradiance(loaded.values.reshape(20, 9, 3), normals @ matrix.T)
+    np.testing.assert_allclose(seen, want, rtol=1e-4, atol=1e-5)
     export(model, tmp_path / "bevy", "bevy", cells=3, axes=axes)
     made = json.loads((tmp_path / "bevy" / "light.json").read_text())
     volume = wlm.probe.load(tmp_path / "bevy" / "light.vxgi.ktx2")

@@ -14,9 +14,8 @@ def _ball(device: str, n: int = 32, voxel: float = 0.5, extinction: float = 0.4)
     """Makes a soft ball with a bump, away from the world's origin."""
     x, y, z = unit_grid(n)
     density = np.clip(1.6 - 2 * np.sqrt(x**2 + y**2 + z**2), 0, 1) * (1 + 0.5 * np.sin(5 * x) * np.cos(4 * y))
-    return from_array(
-        density.astype(np.float32), extinction=extinction, voxel=voxel, origin=(10.0, -3.0, 5.0), device=device
-    )
+    place = (10.0, -3.0, 5.0)
+    return from_array(density.astype(np.float32), extinction=extinction, voxel=voxel, origin=place, device=device)
 
 
 def _camera(volume: DensityVolume, way: tuple = (0.3, 0.4, 1.0), distance: float = 30.0, **options) -> Camera:

@@ -190,9 +190,8 @@ def test_probes_as_balls_and_gaussians(tmp_path, show):
         window.press(str(key))
         assert window.state.view == name
         views[name] = scene_of(window)[40:, : SIZE[0] // 3]
-        shown = {
-            s.name for s in window.sliders.values() if window._widgets[s.name][0].GetRepresentation().GetVisibility()
-        }
+        shown = [s.name for s in window.sliders.values()]
+        shown = {name for name in shown if window._widgets[name][0].GetRepresentation().GetVisibility()}
         assert shown - {"exposure", "error"} == {"balls": set(), "gaussians": {"sigma"}}[name]
     assert np.abs(views["balls"] - views["gaussians"]).max() > 40
     before = scene_of(window)
@@ -231,9 +230,8 @@ def test_balls_are_where_their_probes_are(up, axes, tmp_path, show):
     values[:, 0] = colours * np.sqrt(4 * np.pi)
     write_probes(tmp_path / "four.wlm", np.concatenate([np.zeros((1, 3)), 4 * axes]), values.reshape(4, 27))
     picture = scene_of(show(tmp_path / "four.wlm", up=up))
-    origin, right, above, other = (
-        np.argwhere((np.abs(picture - 255 * colour) < 40).all(2)).mean(0) for colour in colours
-    )
+    near = [np.argwhere((np.abs(picture - 255 * colour) < 40).all(2)) for colour in colours]
+    origin, right, above, other = (each.mean(0) for each in near)
     assert above[0] < origin[0] - 20 and abs(above[1] - origin[1]) < 5  # upright lines converge a little
     assert right[1] > origin[1] + 20 and right[0] > origin[0] + 5
     # Right-handed axes: z points to the viewer's left with y up, y away from the viewer with z up.

@@ -3,8 +3,10 @@
 import base64
 import dataclasses
 import hashlib
+import io
 import json
 import re
+import shlex
 import zlib
 
 import numpy as np
@@ -14,9 +16,12 @@ import yaml
 from builders import atlas_meshes, day_scenes, probe_models, small_sets
 from builders.checks import error_of
 from builders.contract import FILES
+from builders.running import call
+from PIL import Image
 from typer.testing import CliRunner
 
 import wlm
+from demos.tutorials import ROOT, steps
 from wlm.cli.app import app
 from wlm.errors import WlmError
 from wlm.export.page.html import Page
@@ -229,3 +234,26 @@ def test_the_command_without_files_writes_a_viewer(tmp_path):
     result = CliRunner().invoke(app, ["web", "-o", str(tmp_path / "viewer.html")])
     assert result.exit_code == 0, result.output
     assert parts(tmp_path / "viewer.html")[0]["kind"] == "viewer"
+
+
+NEEDED = {
+    "bake": ("wlm compress demos/data/cornell", "wlm export room.wlm -o room-three"),
+    "smoke": ("wlm smoke simulate", "wlm smoke bake", "wlm smoke flipbook six -o puff-three"),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NEEDED)
+def test_the_page_shows_light(name, tmp_path, monkeypatch, visit):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "demos").symlink_to(ROOT / "demos")
+    for kind, text in steps(ROOT / "docs" / "tutorials" / f"{name}.md"):
+        if text.startswith(NEEDED[name]):
+            call(*shlex.split(text)[1:])
+        elif kind not in ("command", "python"):
+            (tmp_path / kind).write_text(text, encoding="utf-8")
+    page = visit(tmp_path, "document.querySelector('canvas')", viewport={"width": 320, "height": 240})
+    page.wait_for_timeout(4000)
+    shown = np.asarray(Image.open(io.BytesIO(page.screenshot(timeout=200_000))).convert("L"), np.float32)
+    # Without light, below the slider, the pages have one colour.
+    assert shown[60:].std() > 5.0

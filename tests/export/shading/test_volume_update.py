@@ -162,10 +162,8 @@ def test_a_walk_fills_the_same_volume(language, kind, request, tmp_path):
     np.testing.assert_array_equal(found["pages"].view(np.int16)[: len(pages)], pages)
     rows, outputs = np.unique(pages[pages >= 0]), 27 if kind == "components" else 12
     assert len(rows) > 40
-    light = [
-        _light(each.reshape(-1, 1 + outputs // 2 + outputs % 2), outputs)
-        for each in (found["pool"], made.reference["pool"])
-    ]
+    one = 1 + outputs // 2 + outputs % 2
+    light = [_light(each.reshape(-1, one), outputs) for each in (found["pool"], made.reference["pool"])]
     np.testing.assert_allclose(light[0][rows], light[1][rows], rtol=2e-3, atol=2e-4 * np.abs(light[1][rows]).max())
 
 
