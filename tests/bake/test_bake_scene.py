@@ -1,4 +1,4 @@
-"""The inputs of a bake: scene files, surfaces, places of texels and probes, and the sun. Mitsuba is not needed."""
+"""The inputs of a bake: scene files, surfaces, places and the sun, and those of a demo. Mitsuba is not needed."""
 
 import io
 import json

@@ -1,4 +1,4 @@
-"""The kernels' benchmark: ceilings, a case at two sizes, the comparison with an older run, and the plot."""
+"""The benchmarks of kernels and operations: cases at two sizes, an older run, the plot, rows of each operation."""
 
 from collections import defaultdict
 from dataclasses import replace

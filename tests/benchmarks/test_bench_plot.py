@@ -1,4 +1,4 @@
-"""The Pareto front by hand, and plots that are drawn, complete and readable."""
+"""Results beside older ones, the Pareto front by hand, and plots that are drawn, complete and readable."""
 
 import json
 import math

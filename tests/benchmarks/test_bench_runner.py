@@ -1,4 +1,4 @@
-"""Rows, their files, tables and pages, and what all benches share."""
+"""Rows, their files, tables and pages, what all benches share, how calls are timed, and the simulated growth."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""`wlm run`: pictures, a film and a report of a scene."""
+"""`wlm run` and `wlm smoke run`: pictures, a film and a report of a scene."""
 
 import json
 import os

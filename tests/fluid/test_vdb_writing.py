@@ -1,4 +1,4 @@
-"""Written OpenVDB files against a reader of their bytes that shares no code with the product's, and against that."""
+"""Written OpenVDB and NanoVDB files against readers of their bytes that share no code with the product's."""
 
 import struct
 import zlib

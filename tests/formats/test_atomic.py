@@ -1,4 +1,4 @@
-"""-"""
+"""Files that are written whole or not at all, and arrays in a file without a name."""
 
 import errno
 import os

@@ -1,4 +1,4 @@
-"""BC7 against two other decoders, bit for bit, and against the format's interpolation."""
+"""BC7, BC6H and ASTC: our encoders and decoders against others, bit for bit, and the formats' interpolation."""
 
 import sys
 

@@ -1,4 +1,4 @@
-"""-"""
+"""EXR files as the OpenEXR library has them, and headers that are refused before it reads them."""
 
 import os
 import re

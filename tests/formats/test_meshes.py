@@ -1,5 +1,4 @@
-"""Meshes in formats other than glTF: positions, UVs and triangles as they are in the file, and one line where it is
-damaged."""
+"""Meshes in formats other than glTF: positions, UVs, triangles and fronts as in the file, and one line where it is damaged."""
 
 from pathlib import Path
 

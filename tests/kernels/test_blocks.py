@@ -1,4 +1,4 @@
-"""Maps as BC7 blocks: the integers that are stored, and the equality of what is trained with the file's bytes."""
+"""Maps as BC7 blocks and light as RGB9E5: the integers that are stored, and what is trained with them."""
 
 import numpy as np
 import torch

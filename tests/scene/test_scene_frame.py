@@ -1,4 +1,4 @@
-"""Frames of a scene against a ray caster in float64, and a film in which a lamp is switched."""
+"""Frames of a scene against a ray caster in float64, a film with a lamp, and the street of the demos."""
 
 import math
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Flip books: every layout and kind of file, written and read, the order of cells, and wrong files."""
+"""Flip books: every layout and kind of file, the order of cells, wrong files, and mip levels that mix no frames."""
 
 import struct
 import zlib

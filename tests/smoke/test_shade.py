@@ -1,4 +1,4 @@
-"""Shading: weights, lights and emission."""
+"""Shading: weights, lights and emission; and six-way lightmaps by least squares over the sphere."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Pictures of smoke: what is drawn where, before and behind the smoke, and in which cell of a sheet."""
+"""Pictures of light and smoke: what is drawn where, before and behind the smoke, and in which cell of a sheet."""
 
 import math
 from dataclasses import replace
