@@ -262,14 +262,8 @@ def test_a_textures_place_is_read(tmp_path):
     assert surface.texture_uv == pytest.approx(np.column_stack([0.5 * v + 0.25, -2.0 * u]), abs=1e-6)
     (surface,) = read_geometry(textured(tmp_path, {}), None).surfaces
     assert surface.texture_uv == pytest.approx(0.5 * np.column_stack([u, v]), abs=1e-6)
-    for wrong in (
-        {"scale": 2.0},
-        {"offset": [0, math.nan]},
-        {"rotation": [1]},
-        {"scale": ["x", 1]},
-        {"texCoord": [1]},
-        {"texCoord": {}},
-    ):
+    wrongs = {"scale": 2.0}, {"offset": [0, math.nan]}, {"rotation": [1]}, {"scale": ["x", 1]}, {"texCoord": [1]}
+    for wrong in (*wrongs, {"texCoord": {}}):
         assert "square.gltf: " in error_of(read_geometry, textured(tmp_path, wrong), None)
 
 

@@ -69,11 +69,10 @@ def test_lightmaps_of_a_material_slot(tmp_path):
     position, triangle, uv = box((0, 0, 0), (1, 1, 1))
     turned = {"KHR_texture_transform": {"rotation": np.pi / 2, "offset": [0.0, 1.0]}}  # (v, 1 - u)
     slots = [{"index": 0}, {"index": 0, "extensions": turned}]
+    right = np.stack([1 - uv[:, 1], 0.5 + uv[:, 0] / 2], 1)
     things = [
         Thing(name, position + 2 * i, triangle, [places], material={"emissiveTexture": slot})
-        for i, (name, slot, places) in enumerate(
-            zip("ab", slots, (uv * [0.5, 1], np.stack([1 - uv[:, 1], 0.5 + uv[:, 0] / 2], 1)), strict=True)
-        )
+        for i, (name, slot, places) in enumerate(zip("ab", slots, (uv * [0.5, 1], right), strict=True))
     ]
     row, column = np.mgrid[:48, :64] / 64
     light = np.stack([0.2 + column, 0.3 + row, 0.5 + 0 * row], 2)

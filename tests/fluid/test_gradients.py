@@ -130,10 +130,8 @@ def test_air(kind: str, device: str):
     np.testing.assert_allclose(totals[1:], totals[:1] * 2, rtol=1e-4, atol=1e-4)
 
 
-SOURCES = (
-    Source("box", (2.0, 4.0, 0.5), (1.0, 1.5, 2.0), 0.05, 0.02),
-    Source("sphere", (5.0, 5.0, 0.5), (1.6, 1.6, 1.6), 0.3, 0.5, fixed=True),
-)
+BOX = Source("box", (2.0, 4.0, 0.5), (1.0, 1.5, 2.0), 0.05, 0.02)
+SOURCES = (BOX, Source("sphere", (5.0, 5.0, 0.5), (1.6, 1.6, 1.6), 0.3, 0.5, fixed=True))
 BUOYANCY = Buoyancy(2e-3, 1e-3)
 
 
@@ -197,10 +195,8 @@ def test_smoke_and_air(device: str):
             density, heat = twin.carry(u, density, heat)
             for number, (source, within) in enumerate(zip(SOURCES, emits, strict=True)):
                 kept, scale = (0.0, 1.0) if source.fixed else (1.0, 2.0)
-                density, heat = (
-                    np.where(within, kept * values + scale * sources[step, number, k], values)
-                    for k, values in enumerate((density, heat))
-                )
+                pairs = zip((density, heat), sources[step, number], strict=True)
+                density, heat = (np.where(within, kept * values + scale * source, values) for values, source in pairs)
         _, u = air.fields(f)
         return (weights[0] * density).sum() + (weights[1] * heat).sum() + (weight_u * u).sum()
 

@@ -158,10 +158,8 @@ def test_smoke_is_that_of_one_device(scheme: str, storage: str, device: str, tmp
 
 
 def test_what_is_refused(device: str):
-    for names, message in (
-        ([device] * 12, "device: expected 1 to 11, the number of cells along x, got 12 devices"),
-        ([], "got 0 devices"),
-    ):
+    wrong = [device] * 12, "device: expected 1 to 11, the number of cells along x, got 12 devices"
+    for names, message in (wrong, ([], "got 0 devices")):
         with pytest.raises(ValueError, match=message):
             Lattice(SHAPE, viscosity=0.1, device=names)
     with pytest.raises(ValueError, match="bricks: expected none on several devices"):

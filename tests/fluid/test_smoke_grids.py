@@ -203,9 +203,7 @@ def test_temperatures_in_kelvin(tmp_path: Path):
     light = black_body_luminance(heat) / black_body_luminance(1500.0)
     np.testing.assert_allclose(volume.temperature, light, rtol=1e-5)
     emitted = 2 * light.max()
-    assert (
-        volume.kelvin and f"are read as kelvins: the hottest voxel emits {emitted:.2g} per length" in volume.warnings[0]
-    )
+    assert volume.kelvin and f"as kelvins: the hottest voxel emits {emitted:.2g} per length" in volume.warnings[0]
     np.testing.assert_array_equal(load_volume(path, up="y", kelvin=True).temperature, volume.temperature)
     raw = load_volume(path, up="y", kelvin=False)
     np.testing.assert_array_equal(raw.temperature, heat)
@@ -281,9 +279,7 @@ def test_one_grid_for_a_sequence(tmp_path: Path):
     write(tmp_path / "s_0001.vdb", "smoke")
     assert not load_frames(tmp_path, up="y").load(1).density.any()
     assert load_frames(tmp_path, up="y", density="smoke").load(1).density.any()
-    assert "fog: expected the name of one of the file's grids of floats, found smoke, flame, density" in error_of(
-        load_frames, tmp_path, density="fog"
-    )
+    assert "fog: expected the name of one of" in error_of(load_frames, tmp_path, density="fog")
 
 
 @pytest.mark.parametrize(

@@ -86,9 +86,8 @@ def test_a_png_that_states_another_encoding(tmp_path, chunks, encoding, stated):
     light = read_encoded(tmp_path / "a.png", encoding, notes)
     assert light[0, 0, 0] == pytest.approx(0.5 if encoding == "linear" else 0.214, abs=1e-3)
     said = [line for line in notes if "the PNG says" in line]
-    assert said == (
-        [f"the PNG says that its levels are {stated}: is its encoding {stated}, not {encoding}?"] * bool(stated)
-    )
+    asked = f"the PNG says that its levels are {stated}: is its encoding {stated}, not {encoding}?"
+    assert said == [asked] * bool(stated)
 
 
 @pytest.mark.parametrize(

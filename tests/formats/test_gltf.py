@@ -26,12 +26,8 @@ class Maker(GltfMaker):
         super().__init__()
         attributes = {"POSITION": self.add(POINTS, min=[0, 0, 0], max=[9, 9, 9]), "TEXCOORD_0": self.add(PLACES)}
         self.primitive = {"attributes": attributes, "indices": self.add(TRIANGLES.reshape(-1).astype(index_type))}
-        self.content |= {
-            "scene": 0,
-            "scenes": [{"nodes": [0]}],
-            "nodes": [{"mesh": 0}],
-            "meshes": [{"primitives": [self.primitive]}],
-        }
+        self.content |= {"scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}]}
+        self.content["meshes"] = [{"primitives": [self.primitive]}]
 
 
 def _read(maker: Maker, path: Path) -> list[GltfPrimitive]:
@@ -103,9 +99,10 @@ def test_a_scene_draws_its_own_nodes_only(tmp_path):
     assert _read(maker, tmp_path) == []
 
 
-@pytest.mark.parametrize(
-    ("name", "scale"), [("uint8", 255), ("uint16", 65535), ("int8", 127), ("int16", 32767), ("uint16", None)]
-)
+SCALES = [("uint8", 255), ("uint16", 65535), ("int8", 127), ("int16", 32767), ("uint16", None)]
+
+
+@pytest.mark.parametrize("name, scale", SCALES)
 def test_integer_uvs(tmp_path, name, scale):
     maker = Maker()
     info = np.iinfo(name)

@@ -35,11 +35,8 @@ def meshopt_scene():
     uvs = np.round(UV * 65535).astype("<u2")
     corners = TRIANGLE.astype("<u2").reshape(-1)
     accessors, start = [], 0
-    for data, mode, kind in (
-        (places, "ATTRIBUTES", "VEC3"),
-        (uvs, "ATTRIBUTES", "VEC2"),
-        (corners, "TRIANGLES", "SCALAR"),
-    ):
+    parts = (places, "ATTRIBUTES", "VEC3"), (uvs, "ATTRIBUTES", "VEC2"), (corners, "TRIANGLES", "SCALAR")
+    for data, mode, kind in parts:
         packed = meshopt.encode_gltf_buffer(data, mode)
         view = maker.content["bufferViews"][maker.view(packed)]
         stride = data.nbytes // len(data)

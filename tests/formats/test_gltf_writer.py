@@ -186,11 +186,8 @@ def test_skins_animations_and_images_find_their_data(tmp_path):
 
     images = content["images"]
     assert payload(images[0]) == b"\x89PNG, say"
-    assert (
-        payload(images[1]) == b"\x89PNG\r\n\x1a\n a picture"
-        and images[1]["mimeType"] == "image/png"
-        and "uri" not in images[1]
-    )
+    assert payload(images[1]) == b"\x89PNG\r\n\x1a\n a picture"
+    assert images[1]["mimeType"] == "image/png" and "uri" not in images[1]
     assert images[2] == {"uri": "gone.jpg"}
 
 

@@ -1,4 +1,4 @@
-"""Meshes in formats other than glTF: positions, UVs, triangles and fronts as in the file, and one line where it is damaged."""
+"""Meshes in formats other than glTF: positions, UVs, triangles and fronts, and one line where a file is damaged."""
 
 from pathlib import Path
 
@@ -54,12 +54,10 @@ def test_a_polygon_is_triangles_and_v_points_down(tmp_path, face):
 def test_a_vertex_is_a_pair_of_v_and_vt(tmp_path):
     mesh = _read(tmp_path, SQUARE + "f 1/1 2/2 3/3\nf 1/1 3/2 4/4\nf 3/2 3/3 1/4")
     assert len(mesh.position) == len(mesh.uv) == 6
-    np.testing.assert_array_equal(
-        mesh.position[mesh.triangle][1:, :, :2], [[[0, 0], [2, 3], [0, 3]], [[2, 3], [2, 3], [0, 0]]]
-    )
-    np.testing.assert_array_equal(
-        mesh.uv[mesh.triangle][1:], [[[0, 1], [1, 1], [0, 0.25]], [[1, 1], [1, 0], [0, 0.25]]]
-    )
+    seen = mesh.position[mesh.triangle][1:, :, :2]
+    np.testing.assert_array_equal(seen, [[[0, 0], [2, 3], [0, 3]], [[2, 3], [2, 3], [0, 0]]])
+    seen = mesh.uv[mesh.triangle][1:]
+    np.testing.assert_array_equal(seen, [[[0, 1], [1, 1], [0, 0.25]], [[1, 1], [1, 0], [0, 0.25]]])
 
 
 def test_several_materials_are_one_mesh(tmp_path):

@@ -360,10 +360,8 @@ def _layers() -> Sequence[bytes]:
     one = {"name": "day", "layers": layers, "period_hours": 24, "lightmaps": lightmaps}
     two = {"layers": {"light": "radiance"}, "lightmaps": [{"time_hours": 0.0, "files": files}]}
     atlas = {"width": 10, "height": 12, "mask": "mask.png"}
-    return tuple(
-        json.dumps(content).encode()
-        for content in (one | {"atlases": {"0": atlas}}, two | {"atlases": {"0": {"mask": "all"}, "1": {}}})
-    )
+    contents = one | {"atlases": {"0": atlas}}, two | {"atlases": {"0": {"mask": "all"}, "1": {}}}
+    return tuple(json.dumps(content).encode() for content in contents)
 
 
 def _frames(path: Path) -> None:
@@ -424,18 +422,8 @@ yes
 {a: 1
 :
 """.strip().split("\n"),
-    *(
-        "0x" + "f" * 5000,
-        "1" * 5000,
-        "1" * 400 + ".5",
-        "9:" * 300 + "9.5",
-        "0b" + "1" * 5000,
-        "[" * 300,
-        "{" * 300,
-        "- " * 300,
-        "\0",
-        "\t",
-    ),
+    *("0x" + "f" * 5000, "1" * 5000, "1" * 400 + ".5", "9:" * 300 + "9.5", "0b" + "1" * 5000, "\0", "\t"),
+    *(each * 300 for each in ("[", "{", "- ")),
 ]
 
 

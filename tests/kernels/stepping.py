@@ -125,13 +125,8 @@ def draw(trainer: Trainer, quantised: bool) -> tuple[np.ndarray, np.ndarray]:
         trainer.batch.quantised = int(quantised)
         place = wp.zeros(shape, dtype=wp.vec3i, device=trainer.device)
         features = wp.zeros(shape, dtype=kernels.net.vec_in, device=trainer.device)
-        wp.launch(
-            kernels.draw,
-            shape,
-            inputs=[trainer._maps, trainer.batch, samples],
-            outputs=[place, features],
-            device=trainer.device,
-        )
+        inputs, outputs = [trainer._maps, trainer.batch, samples], [place, features]
+        wp.launch(kernels.draw, shape, inputs=inputs, outputs=outputs, device=trainer.device)
     return place.numpy(), features.numpy()
 
 

@@ -131,12 +131,7 @@ FACTORIES = [
         "lattice_boundaries", _boundaries, [], (("D3Q19", "float32"), ("D2Q9", "float32"), ("D3Q27", "float16")), BOTH
     ),
     *_cases("fire", lambda stored: [fire.burn_kernel(stored)], [], FLOATS),
-    *_cases(
-        "expansion",
-        lambda storage: [fire.expand_kernel("D3Q19", storage, storage == "float16")],
-        [],
-        ("float32", "float16"),
-    ),
+    *_cases("expansion", lambda of: [fire.expand_kernel("D3Q19", of, of == "float16")], [], ("float32", "float16")),
     *_cases("marks", lambda is_mesh: [lattice_bodies._mark_kernel(is_mesh)], [], BOTH),
     *_cases("advection", _advection, [], BOTH, BOTH, FLOATS),
     *_cases("planes", _planes, [], BOTH),

@@ -179,10 +179,9 @@ def test_each_hour_is_scored_on_its_own_texels():
     decoded = model.decoder().frame(HOURS[2])
     inside = np.abs(decoded - differing.light.frames[2])[40:80, 40:80]
     assert inside.mean() < 0.1 * np.ptp(differing.light.frames[2])
-    expected = [
-        evaluate_frame(differing.light.frames[i], model.decoder().frame(hour), mask[i], metrics=["psnr"]).psnr
-        for i, hour in enumerate(HOURS)
-    ]
+    frames, decoder = differing.light.frames, model.decoder()
+    pairs = ((frames[i], decoder.frame(hour), mask[i]) for i, hour in enumerate(HOURS))
+    expected = [evaluate_frame(*each, metrics=["psnr"]).psnr for each in pairs]
     np.testing.assert_allclose(report.light.psnr_by_time, np.ravel(expected), rtol=1e-6)
 
 

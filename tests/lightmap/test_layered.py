@@ -172,9 +172,7 @@ def test_a_bundle_has_a_part_for_each_sheet():
     model = random_layers()
     bundle = model.bundle()
     listed = bundle.document["sheets"]
-    assert [(item["layer"], item["channels"]) for item in listed] == [
-        (sheet.layer, list(sheet.channels)) for sheet in SHEETS
-    ]
+    assert [(each["layer"], each["channels"]) for each in listed] == [(own.layer, list(own.channels)) for own in SHEETS]
     assert list(bundle.parts) == [item["part"] for item in listed] and not bundle.textures
     light, directions = (bundle.parts[item["part"]] for item in listed[:2])
     assert directions.document["values"] == [-1.0, 1.0]

@@ -77,11 +77,8 @@ def test_integers_with_an_encoding(tmp_path, suffix):
 
 
 def test_a_layer_is_chosen_by_name_in_a_set_and_for_a_mesh(tmp_path):
-    planes = {
-        f"{name}.{letter}": LIGHT[..., i] * (1 + (name == "Gloss"))
-        for name in ("Diff", "Gloss")
-        for i, letter in enumerate("RGB")
-    }
+    names = [(name, i) for name in ("Diff", "Gloss") for i in range(3)]
+    planes = {f"{name}.{'RGB'[i]}": LIGHT[..., i] * (1 + (name == "Gloss")) for name, i in names}
     planes = {name: np.ascontiguousarray(plane) for name, plane in planes.items()}
     for hour in (0, 6):
         OpenEXR.File({"type": OpenEXR.scanlineimage}, dict(planes)).write(str(tmp_path / f"a_{hour:02d}h.exr"))

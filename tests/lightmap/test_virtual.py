@@ -372,9 +372,8 @@ def test_groups_are_added_by_their_weights(device):
         check_tables(virtual)
         assert "expected a group among sky, sun, lamp" in error_of(virtual.set_weights, {"moon": 1.0})
     sheets = {replace(LIGHT, group=str(i)): model.light for i in range(9)}
-    assert error_of(VirtualTexture, LightmapModel("nine", "0" * 16, model.profile, sheets)) == (
-        "nine: expected at most 8 light groups, got 9"
-    )
+    nine = LightmapModel("nine", "0" * 16, model.profile, sheets)
+    assert error_of(VirtualTexture, nine) == "nine: expected at most 8 light groups, got 9"
 
 
 def test_tiles_are_loaded_when_they_are_needed(tmp_path, device):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
+from builders import operation_cases
 from builders.operation_cases import gaussians, network_of, normal, points_between, uniform
 from kernels.compare import close
 
@@ -114,12 +115,7 @@ CASES = {
     ),
     "triplane": (
         _triplane,
-        {
-            "xy": normal(4, 5, 3),
-            "xz": normal(6, 5, 3, seed=9),
-            "yz": normal(6, 4, 3, seed=10),
-            "points": points_between(60, 60, 60, 60),
-        },
+        {name: operation_cases.CASES["triplane"].leaves[name] for name in ("xy", "xz", "yz", "points")},
         plain.triplane,
     ),
     "mlp": (_mlp, network_of(5, 17, 4, 2), plain.mlp),

@@ -167,11 +167,7 @@ REFUSED = [
     ("march", {"emission": torch.zeros(6, 7, 8)}, "emission: expected float32 [6, 7, 8, 3], got"),
     ("march", {"step": 0.0}, "step: expected a number above 0, got 0.0"),
     ("march", {"density": torch.zeros(6, 7, 8).half()}, "density: expected float32 [any, any, any], got torch.float16"),
-    (
-        "plane",
-        {"points": torch.zeros(5, 2).bfloat16()},
-        "points: expected float32 [..., 2], got torch.bfloat16 (5, 2): use its float()",
-    ),
+    ("plane", {"points": torch.zeros(5, 2).bfloat16()}, "points: expected float32 [..., 2], got torch.bfloat16 (5, 2)"),
     ("march", {"g": 1.0}, "g: expected a number between -1 and 1, got 1.0"),
     ("plane", {"points": np.zeros((5, 2))}, "points: expected a torch tensor, float32 [..., 2], got numpy.ndarray"),
     ("bc7_map-layers", {"layer": np.zeros(50, int)}, "layer: expected a torch tensor, int32 or int64 [50], got numpy."),
@@ -317,9 +313,8 @@ def test_rays_that_miss(device: str):
     density = torch.ones(8, 8, 8, device=device, requires_grad=True)
     origin = torch.tensor([[20.0, 4.0, -5.0], [4.0, 4.0, -5.0]], device=device)
     direction = torch.stack([AHEAD, -AHEAD]).to(device)
-    radiance, transmittance = ops.march(
-        density, origin, direction, toward=AHEAD[None].to(device), colour=torch.ones(1, 3, device=device)
-    )
+    light = {"toward": AHEAD[None].to(device), "colour": torch.ones(1, 3, device=device)}
+    radiance, transmittance = ops.march(density, origin, direction, **light)
     (radiance.sum() + transmittance.sum()).backward()
     assert not radiance.any() and (transmittance == 1.0).all() and not density.grad.any()
 

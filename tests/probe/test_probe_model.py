@@ -106,10 +106,8 @@ def test_codes_stand_for_the_whole_numbers():
 def test_the_least_rotation_gives_the_same_ellipsoids():
     rows = random_model(count=500).content.rows()
     least = least_turned(rows)
-    before, after = (
-        Rotation.from_quat(rows[:, [7, 8, 9, 6]]).as_matrix(),
-        Rotation.from_mrp(least[:, STORED_ROTATION]).as_matrix(),
-    )
+    before = Rotation.from_quat(rows[:, [7, 8, 9, 6]]).as_matrix()
+    after = Rotation.from_mrp(least[:, STORED_ROTATION]).as_matrix()
     pairs = ((before, rows[:, 3:6]), (after, least[:, STORED_SCALE]))
     spread = [np.einsum("kij,kj,klj->kil", turn, np.exp(2 * scale), turn) for turn, scale in pairs]
     np.testing.assert_allclose(spread[0], spread[1], atol=1e-6)

@@ -81,14 +81,8 @@ def reference(scene, second, hour, factors=(1.0, 1.0), size=SIZE):
     floor, wall = parts[0] + parts[1]
     even = mixed(list(day_scenes.LIGHT), np.array(list(day_scenes.LIGHT.values())), hour)
     sky = mixed([0.0, 12.0], np.array([[0.0, 0.0, 0.1, 1.0], [0.5, 0.6, 0.8, -1.0]]), hour)
-    table = np.stack(
-        [
-            sky[:3],
-            day_scenes.FLOOR * floor / np.pi,
-            day_scenes.WALL * wall / np.pi,
-            np.multiply(day_scenes.SQUARE, even),
-        ]
-    )
+    lit = day_scenes.FLOOR * floor / np.pi, day_scenes.WALL * wall / np.pi, np.multiply(day_scenes.SQUARE, even)
+    table = np.stack([sky[:3], *lit])
     radiance = table[seen]
     radiance[smoke] = 0.2 * (puff.frame(second) + 1) * even + 0.5 * radiance[smoke]
     shown = 2.0 ** sky[3] * radiance

@@ -23,10 +23,8 @@ from wlm_kernels.smoke.settings import March
 
 SMALL = DatasetSettings(cells=16, refine=2, resolution=32, frames=2, views_a_frame=2, sequences=3)
 SMALL = SMALL.model_copy(update={"warmup": 0.7, "hot": 0.4, "moving": 0.0})
-FEW = SMALL.model_copy(
-    update={"refine": 1, "sequences": 1, "frames": 1, "resolution": 24, "warmup": 0.6}
-    | {"validation_sequences": 1, "views": 4}
-)
+few = {"refine": 1, "sequences": 1, "frames": 1, "resolution": 24, "warmup": 0.6}
+FEW = SMALL.model_copy(update=few | {"validation_sequences": 1, "views": 4})
 NAMES = tuple(field.name for field in dataclasses.fields(Pool))
 
 

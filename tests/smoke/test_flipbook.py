@@ -141,12 +141,8 @@ def test_the_gain_and_the_padding_are_read(tmp_path: Path):
         assert float(raw[0].lightmaps.max()) > 4.9 * float(frames[0].lightmaps.max())
 
 
-LAYERED = {
-    "channels": "{0}",
-    "layers": "C_{0}.R C_{0}.G C_{0}.B",
-    "short": "light{1}.R light{1}.G light{1}.B",
-    "pair": "",
-}
+LAYERED = {"channels": "{0}", "layers": "C_{0}.R C_{0}.G C_{0}.B", "pair": ""}
+LAYERED["short"] = "light{1}.R light{1}.G light{1}.B"
 
 
 @pytest.mark.parametrize("kind", LAYERED)

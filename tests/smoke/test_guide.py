@@ -48,9 +48,8 @@ def test_depth_is_in_the_world(device: str, perspective: bool):
 def test_distance_of_an_orthographic_camera(device: str):
     """The distance changes only the depths, by the same amount, also from very far away."""
     volume = _ball(device)
-    near, far = (
-        guide(volume, _camera(volume, distance=distance), March(1.0, jitter=0.0)) for distance in (30.0, 30_000.0)
-    )
+    cameras = (_camera(volume, distance=distance) for distance in (30.0, 30_000.0))
+    near, far = (guide(volume, camera, March(1.0, jitter=0.0)) for camera in cameras)
     np.testing.assert_allclose(far.maps[:2].cpu(), near.maps[:2].cpu(), atol=1e-3)
     hit = (near.depth > 0) & (far.depth > 0)
     np.testing.assert_allclose((far.depth - near.depth)[hit].cpu(), 29_970.0, atol=0.3)

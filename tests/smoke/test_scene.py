@@ -74,10 +74,7 @@ def _scene(tmp_path, **changed):
         ({"sources": [{"centre": [0, 0.5, 0], "radius": 0.1}], "obstacles": [RESTING]}, "sources.0: it is inside an"),
         ({"sources": [{"centre": [0, 0.5, 0], "radius": 0.1}], "obstacles": [SPHERE | {"radius": 0.3}]}, None),
         ({"obstacles": [RESTING | {"path": [[0, 0, 0, 0]]}]}, "inlets.0: an obstacle covers it"),
-        (
-            {"inlets": [SCENE["inlets"][0], copy.deepcopy(SCENE["inlets"][0]) | {"radius": None}]},
-            "inlets.0: a later inlet covers it",
-        ),
+        ({"inlets": [SCENE["inlets"][0], copy.deepcopy(SCENE["inlets"][0]) | {"radius": None}]}, "inlets.0: a later"),
         ({"obstacles": [SPHERE | {"radius": 0.18, "path": [[0, 2, 0, 0], [9, 0, 0.6, 0]]}]}, "obstacles.0: it is out"),
         ({"obstacles": [SPHERE]}, "obstacles.0: it is thinner than a cell of 0.2 m"),
         ({"obstacles": [SPHERE | {"radius": 0.18}]}, None),

@@ -303,10 +303,8 @@ def test_a_step_learns_from_crops():
 def test_one_seed_gives_one_training_on_one_device(device, temporal):
     """Weights are equal to the bit, also on a GPU with images large enough for parallel sums."""
     pool, edge, steps = small_pool(4, kind="six").to(device), *((1, 3) if device == "cpu" else (4, 12))
-    pool = Pool(
-        *(part.repeat(*(1,) * (part.ndim - 2), edge, edge) for part in (pool.guides, pool.targets, pool.motion)),
-        pool.sequence,
-    )
+    parts = (pool.guides, pool.targets, pool.motion)
+    pool = Pool(*(part.repeat(*(1,) * (part.ndim - 2), edge, edge) for part in parts), pool.sequence)
     settings = TrainSettings(rounds=1, steps=steps, batch=4, temporal=temporal)
     network = NetworkSettings(width=16, levels=4, guide="six", stem=2)
     states = []

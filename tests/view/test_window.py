@@ -133,10 +133,8 @@ def test_tiles_have_the_colours_of_their_kinds(lightmaps, show):
     window.press("2")
     picture = scene_of(window)
     height, width = picture.shape[:2]
-    at = {
-        kind: picture[height // 2 + y, width // 2 + x]
-        for kind, x, y in (("dynamic", -40, -40), ("constant", -40, 40), ("empty", 40, 40))
-    }
+    places = ("dynamic", -40, -40), ("constant", -40, 40), ("empty", 40, 40)
+    at = {kind: picture[height // 2 + y, width // 2 + x] for kind, x, y in places}
     assert at["dynamic"].argmax() == 0 and at["constant"].argmax() == 2
     assert np.ptp(at["empty"]) < 3
     assert "2 dynamic (orange)" in window._texts["caption"].GetInput()
