@@ -49,11 +49,8 @@ def three_scene() -> dict[str, Any]:
         matrix = np.eye(4)
         matrix[3, :3] = shift
         groups.append({"type": "Group", "name": "probes", "matrix": matrix.ravel().tolist(), "children": children})
-    scene = {
-        "type": "Scene",
-        "uuid": "a",
-        "children": [*groups, {"type": "Mesh", "matrix": np.eye(4).ravel().tolist()}],
-    }
+    mesh = {"type": "Mesh", "matrix": np.eye(4).ravel().tolist()}
+    scene = {"type": "Scene", "uuid": "a", "children": [*groups, mesh]}
     return {"metadata": {"version": 4.6, "type": "Object", "generator": "Object3D.toJSON"}, "object": scene}
 
 

@@ -109,10 +109,8 @@ def test_vdb_of_nothing(tmp_path: Path):
 
 # Bytes of a value, of a root, upper, lower and leaf node, of the parts of these before their tables, and of an entry
 # of a table, by the type of a grid (1 floats, 6 vectors): rows of `pnanovdb_grid_type_constants` in `PNanoVDB.h`.
-ROWS = {
-    1: (4, (64, 270400, 33856, 2144), (64, 8256, 1088, 96), 8),
-    6: (12, (96, 532544, 66624, 6272), (96, 8256, 1088, 128), 16),
-}
+ROWS = {1: (4, (64, 270400, 33856, 2144), (64, 8256, 1088, 96), 8)}
+ROWS[6] = (12, (96, 532544, 66624, 6272), (96, 8256, 1088, 128), 16)
 # Offsets of the range of values, which follows the background in a root, and children along an edge and their size.
 LEVELS = ((28, 0, 4096), (8224, 32, 128), (1056, 16, 8), (80, 8, 1))
 

@@ -122,10 +122,7 @@ def test_a_batch_that_no_worker_survives_is_named(lightmaps, monkeypatch):
 
 @pytest.mark.parametrize(
     ("options", "says"),
-    [
-        ({"workers": 0}, "workers: expected at least 1, got 0"),
-        ({"cluster": "auto", "device": "cuda:1"}, "expected cpu or cuda"),
-    ],
+    [({"workers": 0}, "workers: expected at least 1, got 0"), ({"cluster": "auto", "device": "cuda:1"}, "cpu or cuda")],
 )
 def test_wrong_places_are_told_at_once(options, says):
     assert re.search(says, error_of(fit.compress, None, PROFILE, **options))
