@@ -39,7 +39,7 @@ from wlm.atlas.fit import compress
 from wlm.atlas.matching import chart_map
 from wlm.atlas.model import Profile
 from wlm.atlas.shared.weights import peaks_of, scene_weights, variation
-from wlm.atlas.tiles.layout import place
+from wlm.atlas.tiles.layout import Shelves
 from wlm.errors import WlmError
 from wlm.formats.gltf import read_gltf
 from wlm.lightmap.data import SheetFrames
@@ -297,8 +297,8 @@ def _objects(position: np.ndarray, triangle: np.ndarray, chart: np.ndarray, coun
 def _object(position, triangle, texel, chart, own, pieces, factor, name):
     """Returns the scene of one object, whose charts are packed into a new lightmap."""
     sizes = np.array([pieces[number][1].shape[::-1] for number in own]) + _GAP
-    first, tall = place(sizes, max(int(sizes[:, 0].max()), math.ceil(math.sqrt(sizes.prod(1).sum()))))
-    wide = int((first[:, 0] + sizes[:, 0]).max())
+    shelves, width = Shelves(sizes), max(int(sizes[:, 0].max()), math.ceil(math.sqrt(sizes.prod(1).sum())))
+    first, (tall, wide) = shelves.place(width), shelves.extent(width)
     light, mask = np.zeros((len(pieces[0][0]), tall, wide, 3), np.float32), np.zeros((tall, wide), bool)
     shift = np.zeros((len(pieces), 2))
     for number, (x, y) in zip(own, first + _GAP // 2, strict=True):

@@ -28,7 +28,7 @@ from wlm.errors import WlmError
 _PROTOCOL = 5  # large arrays aren't copied
 _PATIENCE = 2.0  # seconds that an idle process gets to end by itself
 _ANSWER = 10.0  # seconds that a cluster gets to accept a connection
-_THREADS = 8  # maximum number: each needs the memory of its call
+_THREADS = 16  # maximum number: each needs the memory of its call
 _TOLD = 2000  # bytes read from the error output of a dead process
 
 _Item = TypeVar("_Item")

@@ -197,9 +197,10 @@ def _weighted(texels: lines.Texels, tables: Tables, block: _Block) -> _Block:
         b = block.ends[2 * line + 1]
         start = int(lines.along(texels, i, a, b) * float(last))
         best = float(lines.HUGE)
+        light = texels.light[i]
         for k in range(wp.min(start, last - 1), wp.min(start, last - 1) + 2):
             share = float(tables.shares[block.mode, k]) / 64.0
-            away = _mixed(a, b, share) - texels.light[i]
+            away = _mixed(a, b, share) - light
             if wp.dot(away, away) < best:
                 best = wp.dot(away, away)
                 block.index[i] = k
@@ -330,7 +331,8 @@ def _encode(
         for c in range(3):
             single = single and texels.light[i, c] == texels.light[0, c]
     if not single:
-        axis, _along = lines.axis_of(lines.moments_of(texels, lines.ALL), _AXIS_ROUNDS)
+        terms = lines.terms_of(texels)
+        axis, _along = lines.axis_of(lines.moments_of(terms, lines.ALL), _AXIS_ROUNDS)
         partition = _split(tables, _subsets(texels, axis))
         best = _Block()
         best.error = lines.HUGE
@@ -352,7 +354,7 @@ def _encode(
                 b = best.ends[2 * line + 1]
                 shares = best.share
                 if step < modes:
-                    part = lines.moments_of(texels, own)
+                    part = lines.moments_of(terms, own)
                     axis = wp.normalize(texels.metric)
                     if kind != _BASE_SCALE:
                         axis, _along = lines.axis_of(part, _AXIS_ROUNDS)

@@ -21,7 +21,6 @@ _POWER_ROUNDS = wp.constant(4)
 _AXIS_ROUNDS = wp.constant(8)
 _REFINED = wp.constant(2)  # number of fits of a line to its texels' nearest indices
 _REFITTED = wp.constant(2)  # number of refits of a block's endpoints to its indices
-_TRIED = wp.constant(2)  # number of partitions tried that are encoded
 
 _Codes = wp.types.matrix(shape=(4, 3), dtype=int)
 
@@ -160,16 +159,13 @@ def _encoded(texels: lines.Texels, tables: Tables, ends: lines.Ends, mode: int, 
                 palette[8 * line + k, c] = lines.light_of((mixed * 31) >> 6)
     error = float(0.0)
     for i in range(lines.TEXELS):
-        start = int(0)
-        if lines.in_mask(mask, i):
-            start = 8
-        last = steps
-        if i == 0 or (count == 2 and i == anchor):
-            last = steps // 2
+        start = wp.where(lines.in_mask(mask, i), 8, 0)
+        last = wp.where(i == 0 or (count == 2 and i == anchor), steps // 2, steps)
         best = float(lines.HUGE)
         index = int(0)
+        light = texels.light[i]  # each read of a struct's matrix copies all of it: not in the inner loop
         for k in range(last + 1):
-            away = palette[start + k] - texels.light[i]
+            away = palette[start + k] - light
             square = wp.dot(away, away)
             if square < best:
                 best = square
@@ -206,29 +202,28 @@ def _refitted(texels: lines.Texels, block: _Block, mask: int, ends: lines.Ends, 
 
 
 @wp.func
-def _split(texels: lines.Texels, tables: Tables, whole: lines.Moments, tried: int) -> wp.vec2:
-    """Finds the partition, among those not in the bit mask `tried`, whose two lines fit best. Returns its number and
-    the expected weighted sum of squared errors."""
-    least = float(lines.HUGE)
-    partition = int(0)
+def _split(terms: lines.Terms, tables: Tables, whole: lines.Moments) -> wp.vec4:
+    """Finds the two partitions whose two lines fit best. Returns the number of each and its expected weighted sum of
+    squared errors."""
+    best = wp.vec4(0.0, lines.HUGE, 0.0, lines.HUGE)
     for p in range(32):
-        if ((tried >> p) & 1) == 0:
-            second = lines.moments_of(texels, tables.masks[p])
-            left = float(0.0)
-            along = float(0.0)
-            for line in range(2):
-                part = second
-                if line == 0:
-                    part = whole - second
-                left += lines.spread(part)
-                _axis, scatter = lines.axis_of(part, _POWER_ROUNDS)
-                along += scatter
-            # An index of three bits leaves 1/49 of the scatter along a line.
-            left = left - along * (48.0 / 49.0)
-            if left < least:
-                least = left
-                partition = p
-    return wp.vec2(float(partition), least)
+        second = lines.moments_of(terms, tables.masks[p])
+        left = float(0.0)
+        along = float(0.0)
+        for line in range(2):
+            part = second
+            if line == 0:
+                part = whole - second
+            left += lines.spread(part)
+            _axis, scatter = lines.axis_of(part, _POWER_ROUNDS)
+            along += scatter
+        # An index of three bits leaves 1/49 of the scatter along a line.
+        left = left - along * (48.0 / 49.0)
+        if left < best[1]:
+            best = wp.vec4(float(p), left, best[0], best[1])
+        elif left < best[3]:
+            best = wp.vec4(best[0], best[1], float(p), left)
+    return best
 
 
 @wp.func
@@ -259,9 +254,7 @@ def _write_block(number: int, block: _Block, tables: Tables, blocks: wp.array2d[
     if mode < 10:
         place = 82
     for i in range(lines.TEXELS):
-        own = width
-        if i == 0 or i == anchor:
-            own = width - 1
+        own = wp.where(i == 0 or i == anchor, width - 1, width)
         for b in range(own):
             bit = wp.uint32((block.index[i] >> b) & 1)
             word[place >> 5] = word[place >> 5] | (bit << wp.uint32(place & 31))
@@ -287,35 +280,30 @@ def _encode(
     """
     number = wp.tid()
     texels = lines.gathered(light, weight, number, False)
-    whole = lines.moments_of(texels, lines.ALL)
+    terms = lines.terms_of(texels)
+    whole = lines.moments_of(terms, lines.ALL)
     # An index of four bits leaves 1/225 of the scatter along a line.
     _axis, along = lines.axis_of(whole, _AXIS_ROUNDS)
     alone = lines.spread(whole) - along * (224.0 / 225.0)
     best = _Block()
     best.error = lines.HUGE
-    tried = int(0)  # one bit per partition
-    for attempt in range(1 + _TRIED):  # one line, then two
+    split = _split(terms, tables, whole)
+    for attempt in range(3):  # one line, then the two lines of each partition
         count = int(1)
         steps = int(15)
         partition = int(0)
         mask = int(0)
         anchor = int(0)
-        first_mode = int(10)
-        last_mode = int(14)
         promising = bool(True)
         if attempt > 0:
-            split = _split(texels, tables, whole, tried)
-            partition = int(split[0])
-            tried = tried | (1 << partition)
-            promising = split[1] < alone
+            partition = int(split[2 * attempt - 2])
+            promising = split[2 * attempt - 1] < alone
             count = 2
             steps = 7
             mask = tables.masks[partition]
             anchor = tables.anchors[partition]
-            first_mode = 0
-            last_mode = 10
         if promising:
-            second = lines.moments_of(texels, mask)
+            second = lines.moments_of(terms, mask)
             ends = lines.Ends()
             block = _Block()
             for round in range(1 + _REFITTED):
@@ -332,7 +320,7 @@ def _encode(
                     else:
                         ends = _refitted(texels, block, own, ends, line, steps)
                     ends = _turned(texels, ends, line, start)
-                mode = _finest(tables, ends, first_mode, last_mode, 2 * count)
+                mode = _finest(tables, ends, wp.where(count == 1, 10, 0), wp.where(count == 1, 14, 10), 2 * count)
                 block = _encoded(texels, tables, ends, mode, partition)
                 if block.error < best.error:
                     best = block

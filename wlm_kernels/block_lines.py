@@ -23,6 +23,7 @@ Indices = wp.types.vector(length=16, dtype=int)
 Numbers = wp.types.vector(length=16, dtype=float)
 Ends = wp.types.matrix(shape=(4, 3), dtype=float)
 Moments = wp.types.vector(length=10, dtype=float)
+Terms = wp.types.matrix(shape=(16, 10), dtype=float)
 
 
 @wp.struct
@@ -104,16 +105,25 @@ def scaled_place(texels: Texels, texel: int) -> wp.vec3:
 
 
 @wp.func
-def moments_of(texels: Texels, mask: int) -> Moments:
-    """Sums weights, weighted colours (`scaled_place`) and their six weighted products over the texels in `mask`."""
-    total = Moments()
+def terms_of(texels: Texels) -> Terms:
+    """Returns each texel's terms of the moments: weight, weighted colour (`scaled_place`), six weighted products."""
+    terms = Terms()
     square = wp.cw_mul(texels.metric, texels.metric)
     for i in range(TEXELS):
+        point = scaled_place(texels, i)
+        x, y, z = point[0], point[1], point[2]
+        weight = wp.dot(wp.cw_div(texels.pull[i], square), wp.vec3(1.0 / 3.0))
+        terms[i] = weight * Moments(1.0, x, y, z, x * x, x * y, x * z, y * y, y * z, z * z)
+    return terms
+
+
+@wp.func
+def moments_of(terms: Terms, mask: int) -> Moments:
+    """Sums the terms of the texels in `mask`."""
+    total = Moments()
+    for i in range(TEXELS):
         if in_mask(mask, i):
-            point = scaled_place(texels, i)
-            x, y, z = point[0], point[1], point[2]
-            weight = wp.dot(wp.cw_div(texels.pull[i], square), wp.vec3(1.0 / 3.0))
-            total += weight * Moments(1.0, x, y, z, x * x, x * y, x * z, y * y, y * z, z * z)
+            total += terms[i]
     return total
 
 

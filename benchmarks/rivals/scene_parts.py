@@ -16,11 +16,12 @@ from wlm.atlas.data import LightmappedScene
 from wlm.atlas.decode import Decoder
 from wlm.atlas.fit import with_fallback
 from wlm.atlas.model import BLOCKS, COLOUR_BITS, LUT_BITS, SOURCE_BITS, TEXELS, AtlasModel, Profile, tile_counts
-from wlm.atlas.stages import Stages, one_thread
+from wlm.atlas.stages import Stages
 from wlm.atlas.tiles.fit import Tiles, composed_model, curves, cut, least_gain, solved
 from wlm.atlas.tiles.layout import Layout, Size, layout, sizes_of
 from wlm.atlas.views import Points
 from wlm.atlas.weights import FineGrid
+from wlm.interop import one_thread
 
 _FORMATS = (TEXELS, BLOCKS)  # of the textures of the colours that scenes have
 _TRIES, _CLOSE = 8, 1.005  # attempts to find the share that has the requested bits, and the ratio that is close enough
@@ -87,7 +88,7 @@ def _compressed(
 ) -> SceneParts:
     tiles, parts = _cut(scene, weights, profile, device)
     sizes = sizes_of(profile)
-    error = torch.from_numpy(curves(tiles, sizes, Stages(device)))
+    error = curves(tiles, sizes, Stages(device))
     share, tries = bits / (scene.texels * SOURCE_BITS), []
     for _ in range(_TRIES):
         placed = [_placed(error[:, part.tiles], sizes, part, share, profile) for part in parts]

@@ -22,6 +22,7 @@ from wlm.formats.shared_exponent import LARGEST
 from wlm.ops.hdr_blocks import encoded_blocks
 
 BLOCK_CODECS = ("bc6h", "astc")
+_Array = np.ndarray | torch.Tensor
 _EXTRA = "atlas"
 _MANTISSA = 512  # mantissa steps of RGB9E5, and its least exponent, where the largest channel is below 2 ** -15
 _LEAST_EXPONENT = -15
@@ -33,18 +34,36 @@ def block_grid(height: int, width: int) -> tuple[int, int]:
     return math.ceil(height / BLOCK_SIDE), math.ceil(width / BLOCK_SIDE)
 
 
-def quantise(
-    texels: np.ndarray | torch.Tensor, colour: str, weight: np.ndarray | torch.Tensor | None = None, device: str = "cpu"
-) -> dict[str, np.ndarray]:
-    """Encodes the colour texture T_p, [H, W, 3] on any device. Returns the arrays `texels` and, for a block format,
-    `blocks` of `AtlasModel`. BC6H weights the squared errors of texels with `weight` [H, W]."""
-    if colour in BLOCK_CODECS:
-        blocks, decoded = encode(texels, colour, weight, device)
-        return {"texels": decoded, "blocks": blocks}
+def quantise(texels: _Array, colour: str, weight: _Array | None = None, device: str = "cpu") -> dict[str, np.ndarray]:
+    """Encodes the colour texture T_p as `quantised` does, and returns numpy arrays."""
+    return {name: part.cpu().numpy() for name, part in quantised(texels, colour, weight, device).items()}
+
+
+def quantised(texels: _Array, colour: str, weight: _Array | None, device: str) -> dict[str, torch.Tensor]:
+    """Encodes a linear texture such as T_p, [H, W, 3] on any device. Returns, on `device`, the arrays of `AtlasModel`:
+    `texels` as decoded, half [H, W, 3], and, for a block format, `blocks`, uint8 [B, 16], row by row.
+
+    Block formats clamp values, also infinite ones, to [0, 65504] and weight the squared errors of texels with `weight`
+    [H, W]. If H or W is no multiple of 4, the last row or column is repeated.
+    """
     if colour == "rgb9e5":
-        return {"texels": _rounded(_on(texels, device)).half().cpu().numpy()}
-    texels = texels.cpu().numpy() if isinstance(texels, torch.Tensor) else texels
-    return {"texels": texels.clip(0.0, HALF_MAX).astype(np.float16)}
+        return {"texels": _rounded(_on(texels, device)).half()}
+    if colour not in BLOCK_CODECS:
+        texels = texels.cpu().numpy() if isinstance(texels, torch.Tensor) else texels
+        return {"texels": torch.from_numpy(texels.clip(0.0, HALF_MAX).astype(np.float16)).to(device)}
+    light = _on(texels, device)
+    if count := int(light.isnan().any(2).sum()):
+        raise ValueError(f"texels: expected no NaN, found {count} texels with NaN")
+    height, width = light.shape[:2]
+    below, right = -height % BLOCK_SIDE, -width % BLOCK_SIDE
+    light = light.clamp(0.0, HALF_MAX).float()
+    light = torch.cat([light, light[-1:].expand(below, -1, -1)]) if below else light
+    light = torch.cat([light, light[:, -1:].expand(-1, right, -1)], 1) if right else light
+    weight = torch.ones((height, width), device=device) if weight is None else _on(weight, device)
+    padded = pad(weight.float(), (0, right, 0, below))[None, ..., None]
+    blocks, decoded = encoded_blocks(colour, _by_block(light[None]), _by_block(padded)[..., 0])
+    whole = _of_blocks(decoded, 1, *light.shape[:2])[0, :height, :width]
+    return {"texels": whole.half(), "blocks": blocks}
 
 
 def stored(samples: torch.Tensor, weight: torch.Tensor | None, colour: str) -> torch.Tensor:
@@ -84,29 +103,6 @@ def _of_blocks(texels: torch.Tensor, count: int, ny: int, nx: int) -> torch.Tens
     return cells.transpose(2, 3).reshape(count, ny, nx, 3)
 
 
-def encode(
-    texels: np.ndarray | torch.Tensor, codec: str, weight: np.ndarray | torch.Tensor | None = None, device: str = "cpu"
-) -> tuple[np.ndarray, np.ndarray]:
-    """Encodes a linear texture, [H, W, 3] on any device, as "bc6h" or "astc". Values, also infinite ones, are clamped
-    to [0, 65504]. If H or W is no multiple of 4, the last row or column is repeated.
-
-    Returns blocks, uint8 [B, 16], row by row; and their decoded texels, half [H, W, 3].
-    """
-    light = _on(texels, device)
-    if count := int(light.isnan().any(2).sum()):
-        raise ValueError(f"texels: expected no NaN, found {count} texels with NaN")
-    height, width = light.shape[:2]
-    below, right = -height % BLOCK_SIDE, -width % BLOCK_SIDE
-    light = light.clamp(0.0, HALF_MAX).float()
-    light = torch.cat([light, light[-1:].expand(below, -1, -1)]) if below else light
-    light = torch.cat([light, light[:, -1:].expand(-1, right, -1)], 1) if right else light
-    weight = torch.ones((height, width), device=device) if weight is None else _on(weight, device)
-    padded = pad(weight.float(), (0, right, 0, below))[None, ..., None]
-    blocks, decoded = encoded_blocks(codec, _by_block(light[None]), _by_block(padded)[..., 0])
-    whole = _of_blocks(decoded, 1, *light.shape[:2])[0, :height, :width]
-    return blocks.cpu().numpy(), whole.half().cpu().numpy()
-
-
 def decode(blocks: np.ndarray, height: int, width: int, codec: str) -> np.ndarray:
     """Decodes a texture of blocks, uint8 [B, 16], to float32 [height, width, 3], finite, in [0, 65504]."""
     rows, columns = block_grid(height, width)
@@ -125,5 +121,5 @@ def decode(blocks: np.ndarray, height: int, width: int, codec: str) -> np.ndarra
     return texels
 
 
-def _on(values: np.ndarray | torch.Tensor, device: str) -> torch.Tensor:
+def _on(values: _Array, device: str) -> torch.Tensor:
     return torch.as_tensor(values if isinstance(values, torch.Tensor) else np.array(values), device=device)

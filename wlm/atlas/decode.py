@@ -44,7 +44,7 @@ class Decoder:
             self._sheets = wp.array(model.table(), dtype=int, device=self.device)
         else:
             lut = (model.lut / np.float32(LUT_STEPS)).astype(np.float32)
-            self._texels = wp.array(model.texels[0].astype(np.float32), dtype=float, device=self.device)
+            self._texels = interop.to_warp(torch.tensor(model.texels[0], device=self.device).float())
             self._lut = wp.array(lut, dtype=float, device=self.device)
         self._corner = torch.tensor(model.uv, device=self.device)
 

@@ -87,7 +87,8 @@ def compress(
     stages.place = place
     try:
         with one_thread(device):
-            fit = fit_shared if method == "shared" else functools.partial(_fit_one, method)
+            grid = FineGrid(scene.sheets[0], device) if method != "shared" else None
+            fit = functools.partial(_fit_one, method, grid) if grid else fit_shared
             model = fit(scene, profile, seed, stages)
     except KeyboardInterrupt:
         if checkpoint is not None:
@@ -97,7 +98,7 @@ def compress(
         texels = model.texels.size + model.block_texels.size
         check_area(place.size, texels // 3, model.lut[..., 0].size)
     report = model.report | {"seconds": stages.seconds}
-    if lines := _lost_light(scene, model, device):
+    if lines := _lost_light(scene, model, device, grid):
         report["lost light"] = lines
     return replace(model, stored=store(scene), report=report)
 
@@ -134,10 +135,11 @@ def open_checkpoint(
     return Checkpoint(os.path.realpath(output), AtlasModel.SYSTEM, fit, scene.source, resume=resume, every=every)
 
 
-def _fit_one(method: str, scene: LightmappedScene, profile: Profile, seed: int, stages: Stages) -> AtlasModel:
+def _fit_one(
+    method: str, grid: FineGrid, scene: LightmappedScene, profile: Profile, seed: int, stages: Stages
+) -> AtlasModel:
     """Compresses one lightmap by `tiles` or `cascade`, or by a plain smaller lightmap if that is no worse."""
-    (sheet,), device = scene.sheets, stages.device
-    grid = FineGrid(sheet, device)
+    (sheet,) = scene.sheets
     if method == "tiles":
         model = fit_tiles(scene, grid, profile, seed, stages)
     else:
@@ -153,14 +155,15 @@ def _fit_one(method: str, scene: LightmappedScene, profile: Profile, seed: int, 
     return model
 
 
-def _lost_light(scene: LightmappedScene, model: AtlasModel, device: str) -> list[str]:
-    """Makes lines of text about texels that lost more than half of their light where PSNR doesn't show it."""
+def _lost_light(scene: LightmappedScene, model: AtlasModel, device: str, grid: FineGrid | None) -> list[str]:
+    """Makes lines of text about texels that lost more than half of their light where PSNR doesn't show it. `grid` has
+    the only lightmap on the device; None if there are several."""
     lost, decoder = LostLight(), Decoder(model, device)
     for number, sheet in enumerate(scene.sheets):
         inside = torch.from_numpy(sheet.mask).to(device)
         for state, lightmap in enumerate(sheet.lightmaps):
-            light = torch.from_numpy(lightmap).to(device)[inside]
-            lost.add(light, decoder.texels(sheet, number, state))
+            light = grid.light if grid else torch.from_numpy(lightmap).to(device)
+            lost.add(light[inside], decoder.texels(sheet, number, state))
     return lost.warnings(scene.name, "texel", "the lightmap" if scene.texels == sheet.mask.size else "the lightmaps")
 
 
@@ -176,27 +179,25 @@ def with_fallback(
     format = BLOCKS if profile.colour == "mixed" else profile.colour
     block = BLOCK_SIDE if format in colour.BLOCK_CODECS else 1
     size = fitting_size(height, width, bits, (block, block), COLOUR_BITS[format])
-    if size is None:
-        if model is not None:
-            return model
-        size = 1, 1
-    textures = colour.quantise(resized(grid.light, grid.mask, *size, device=device), format, device=device)
-    places = (SheetPlace(sheet.name, height, width),)
-    settings = (scene.name, scene.source, profile, "plain", format, scene.states, places)
-    plain = AtlasModel(*settings, **{name: each[None] for name, each in textures.items()})
-    if model is None:
-        return replace(plain, report={"why plain": "tiles do not fit the budget"})
-    decoders = [Decoder(each, device) for each in (model, plain)]
-    errors = torch.zeros(2, dtype=torch.float64)
-    for points, share in _cell_centres(grid, weight):
-        target = texture(grid.light, points.uv)
-        for i, decoder in enumerate(decoders):
-            errors[i] += float(((decoder(points) - target).double().square().sum(1) * share).sum())
-    error, plain_error = errors.tolist()
-    ratio = {"error against a plain lightmap of as many bits": error / plain_error if plain_error else None}
-    if error < plain_error:
-        return replace(model, report=model.report | ratio)
-    return replace(plain, report=ratio | {"why plain": f"its error is no larger than that of {model.method}"})
+    if size is None and model is not None:
+        return model
+    textures = colour.quantised(resized(grid.light, grid.mask, *(size or (1, 1)), device=device), format, None, device)
+    report: dict[str, Any] = {"why plain": "tiles do not fit the budget"}
+    if model is not None:
+        decoder, small = Decoder(model, device), textures["texels"].float()
+        errors = torch.zeros(2, dtype=torch.float64)
+        for points, share in _cell_centres(grid, weight):
+            target = texture(grid.light, points.uv)
+            for i, light in enumerate((decoder(points), texture(small, points.uv))):
+                errors[i] += float(((light - target).double().square().sum(1) * share).sum())
+        error, plain_error = errors.tolist()
+        report = {"error against a plain lightmap of as many bits": error / plain_error if plain_error else None}
+        if error < plain_error:
+            return replace(model, report=model.report | report)
+        report["why plain"] = f"its error is no larger than that of {model.method}"
+    settings = (scene.name, scene.source, profile, "plain", format, scene.states)
+    parts = {name: each[None].cpu().numpy() for name, each in textures.items()}
+    return AtlasModel(*settings, (SheetPlace(sheet.name, height, width),), **parts, report=report)
 
 
 def _cell_centres(grid: FineGrid, weight: torch.Tensor) -> Iterator[tuple[Points, torch.Tensor]]:

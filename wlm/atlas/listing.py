@@ -31,7 +31,7 @@ from wlm.errors import WlmError
 from wlm.formats.godot import read_users
 from wlm.formats.light import SUFFIXES
 from wlm.formats.limits import INDEX_BYTES
-from wlm.formats.reading import named_file, read_json_file
+from wlm.formats.reading import named_file, read_json_file, system_errors
 from wlm.formats.unity_asset import has_lightmap
 from wlm.system import Header
 
@@ -218,10 +218,8 @@ def _from_bake(path: str) -> Listing:
 
 
 def _from_folder(where: str, folder: Path) -> Listing:
-    try:
+    with system_errors(f"{where}: cannot read"):
         names = sorted(entry.name for entry in folder.iterdir() if entry.is_file() and entry.name[0] != ".")
-    except OSError as error:
-        raise WlmError(f"{where}: cannot read: {error.strerror or error}") from error
     sheets = [
         SheetFiles(files=[f"{folder.name}/{name}"], name=name) for name in names if name.lower().endswith(SUFFIXES)
     ]

@@ -43,29 +43,34 @@ def resized(
 
 def box(image: torch.Tensor, height: int, width: int) -> torch.Tensor:
     """Reduces an image, float64 [H, W, C], to [height, width, C]: each new texel is the mean over its square."""
-    return _along(_box(width, image.shape[1]), _along(_box(height, image.shape[0]), image))
+    down, across = (_on(_box(new, old), image.device) for new, old in ((height, len(image)), (width, image.shape[1])))
+    return _along(across, _along(down, image))
 
 
-def _along(matrix: sparse.csr_matrix, image: torch.Tensor) -> torch.Tensor:
-    """Multiplies a matrix [new, old] with an image [old, N, C] along the first axis; returns [new, N, C]."""
+def _on(matrix: sparse.csr_matrix, device: torch.device) -> torch.Tensor:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # about sparse tensors, whose interface may change
         parts = (torch.from_numpy(values) for values in (matrix.indptr, matrix.indices, matrix.data))
-        on_device = torch.sparse_csr_tensor(*parts, matrix.shape, dtype=torch.float64).to(image.device)
-    product = on_device @ image.reshape(len(image), -1)
-    return product.reshape(matrix.shape[0], *image.shape[1:]).transpose(0, 1)
+        return torch.sparse_csr_tensor(*parts, matrix.shape, dtype=torch.float64).to(device)
+
+
+def _along(matrix: torch.Tensor, image: torch.Tensor) -> torch.Tensor:
+    """Multiplies a matrix [new, old] with an image [old, N, C] along the first axis; returns [N, new, C]."""
+    product = matrix @ image.reshape(len(image), -1)
+    return product.reshape(len(matrix), *image.shape[1:]).transpose(0, 1)
 
 
 def _fit(filled: torch.Tensor, mask: torch.Tensor, start: torch.Tensor) -> torch.Tensor:
     """Refines a small image by conjugate gradients, so that bilinear reads match `filled` at the mask; [h, w, 3]."""
-    rows, columns = (_bilinear(new, old) for new, old in zip(mask.shape, start.shape[:2], strict=True))
-    turned_rows, turned_columns = rows.T.tocsr(), columns.T.tocsr()
+    both = [_bilinear(new, old) for new, old in zip(mask.shape, start.shape[:2], strict=True)]
+    rows, columns, turned_rows, turned_columns = (_on(m, start.device) for m in (*both, *(m.T.tocsr() for m in both)))
+    mask = mask.T.contiguous().T[..., None]  # in the memory order of what `read` returns
 
     def read(small: torch.Tensor) -> torch.Tensor:
         return _along(columns, _along(rows, small))
 
     def gathered(image: torch.Tensor) -> torch.Tensor:
-        return _along(turned_columns, _along(turned_rows, image * mask[..., None]))
+        return _along(turned_columns, _along(turned_rows, image * mask))
 
     change = torch.zeros_like(start)
     residual = gathered(filled - read(start))

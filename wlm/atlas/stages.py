@@ -2,8 +2,8 @@
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from typing import Any
 
-import numpy as np
 import torch
 
 from wlm.dispatch import Place
@@ -35,14 +35,13 @@ class Stages:
             torch.cuda.synchronize(self.device)
         self.seconds[name] = meter.seconds
 
-    def batch(
-        self, number: int, table: Mapping[str, Part], make: Callable[[], Mapping[str, np.ndarray]]
-    ) -> Mapping[str, np.ndarray]:
+    def batch(self, number: int, table: Mapping[str, Part], make: Callable[[], Mapping[str, Any]]) -> Mapping[str, Any]:
         """Returns the arrays of a batch by name: from the checkpoint if it has them, checked against `table`, or else
-        from `make`, and then saves them."""
+        from `make`, and then saves them. Tensors stay on their device, without a copy, if there is no checkpoint."""
         if self.checkpoint is None:
             return make()
         if (kept := self.checkpoint.finished(number, table)) is None:
-            kept = make()
+            made = make().items()
+            kept = {name: each.cpu().numpy() if isinstance(each, torch.Tensor) else each for name, each in made}
             self.checkpoint.add_finished(number, kept)
         return kept

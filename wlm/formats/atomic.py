@@ -8,6 +8,7 @@ from pathlib import Path
 
 from wlm.errors import WlmError
 from wlm.formats.lock import temporary
+from wlm.formats.reading import system_errors
 
 
 @contextmanager
@@ -20,7 +21,7 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     """
     # Links are resolved first: os.replace would replace the link itself.
     target = Path(os.path.realpath(path))
-    try:
+    with system_errors(f"{path}: cannot write"):
         # Renaming over a device such as /dev/null would destroy it.
         if os.path.lexists(target) and not stat.S_ISREG(os.stat(target).st_mode):
             raise WlmError(f"{path}: cannot write: expected a file or none, found a folder, a device or a pipe")
@@ -36,8 +37,6 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
                 os.close(handle)
             os.replace(part, target)
             sync_folder(target.parent)
-    except OSError as error:
-        raise WlmError(f"{path}: cannot write: {error.strerror or error}") from error
 
 
 def sync_folder(folder: Path) -> None:

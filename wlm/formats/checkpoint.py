@@ -23,6 +23,7 @@ from wlm.errors import WlmError, one_line
 from wlm.formats.artifact import read_artifact, write_artifact
 from wlm.formats.lock import sweep
 from wlm.formats.parts import Part, check_parts
+from wlm.formats.reading import system_errors
 
 SUFFIX = ".partial"
 EVERY = 30.0
@@ -167,10 +168,8 @@ class Checkpoint:
 
     def remove(self) -> None:
         """Removes the file, if it exists, once the output has been written."""
-        try:
+        with system_errors(f"{self.path}: cannot remove"):
             self.path.unlink(missing_ok=True)
-        except OSError as error:
-            raise WlmError(f"{self.path}: cannot remove: {error.strerror or error}") from error
 
     def _write(self) -> None:
         tensors = {

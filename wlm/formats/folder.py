@@ -17,7 +17,7 @@ import numpy as np
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_write, sync_folder
 from wlm.formats.lock import is_passing, locked, temporary
-from wlm.formats.reading import read_json_file
+from wlm.formats.reading import read_json_file, system_errors
 
 UNFINISHED = "unfinished"
 """Key that marks the temporary index of a folder while files are moved into it."""
@@ -31,13 +31,11 @@ def claim(folder: Path, index: str, format_name: str) -> None:
 
     The earlier output is recognised by its index file and the `format` in it.
     """
-    try:
+    with system_errors(f"{folder}: cannot write there"):
         if folder.exists() and read_index(folder / index).get("format") != format_name:
             # Temporary files of a killed process do not count.
             if not all(is_passing(path.name) for path in folder.iterdir()):
                 raise WlmError(f"{folder}: expected an empty folder or an earlier output, found other files")
-    except OSError as error:
-        raise WlmError(f"{folder}: cannot write there: {error.strerror or error}") from error
     parent = folder.resolve().parent
     if not parent.is_dir():
         raise WlmError(f"{folder}: cannot write: the folder {parent} does not exist")
@@ -52,10 +50,8 @@ def made_parents(folder: Path) -> Iterator[None]:
     parent = Path(os.path.abspath(folder)).parent
     missing = [each for each in (parent, *parent.parents) if not each.exists()]
     try:
-        try:
+        with system_errors(f"{folder}: cannot write there"):
             parent.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise WlmError(f"{folder}: cannot write there: {error.strerror or error}") from error
         yield
     except BaseException:
         with suppress(OSError):
@@ -74,14 +70,12 @@ def staged(folder: Path, index: str, format_name: str) -> Iterator[Path]:
     lacks are removed. If the move is interrupted, the folder's index is marked `UNFINISHED`: it cannot be read, but it
     can be written again.
     """
-    with locked(folder):
+    with locked(folder), system_errors(f"{folder}: cannot write there"):
         claim(folder, index, format_name)
         try:
             with temporary(Path(os.path.realpath(folder)), folder=True) as made:
                 yield made
                 _move(made, folder, index, format_name)
-        except OSError as error:
-            raise WlmError(f"{folder}: cannot write there: {error.strerror or error}") from error
         except WlmError as error:
             raise WlmError(str(error).replace(str(made), str(folder))) from error
 

@@ -152,6 +152,15 @@ class _Handle(io.FileIO):
 
 
 @contextmanager
+def system_errors(text: str) -> Iterator[None]:
+    """Turns an error of the operating system in the block into a line: a text, "a.png: cannot read", and a reason."""
+    try:
+        yield
+    except OSError as error:
+        raise WlmError(f"{text}: {error.strerror or error}") from error
+
+
+@contextmanager
 def damaged(message: str, *errors: type[Exception]) -> Iterator[None]:
     """Turns the given exceptions, raised in the block by damaged data, into a one-line error: message and reason."""
     try:

@@ -15,6 +15,7 @@ from wlm.formats.godot import read_users
 from wlm.formats.hours import hours_of_names
 from wlm.formats.light import SUFFIXES
 from wlm.formats.meshes import SUFFIXES as MESHES
+from wlm.formats.reading import system_errors
 from wlm.inspection.files import (
     BAKED,
     FRAMES,
@@ -132,10 +133,8 @@ def _folder(folder: Path, most: int) -> tuple[list[Finding], list[Path]]:
 
 
 def _entries(folder: Path) -> list[Path]:
-    try:
+    with system_errors(f"{folder}: cannot read the folder"):
         found = [Path(entry.path) for entry in islice(os.scandir(folder), _ENTRIES) if entry.name[0] != "."]
-    except OSError as error:
-        raise WlmError(f"{folder}: cannot read the folder: {error.strerror or error}") from error
     return sorted(found, key=lambda path: (natural(path.name), path.name))
 
 

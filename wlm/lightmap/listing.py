@@ -20,7 +20,7 @@ from wlm.formats.hours import DAY, hours_of_names
 from wlm.formats.levels import SUFFIXES as LEVEL_SUFFIXES
 from wlm.formats.light import EXPECTED, SUFFIXES
 from wlm.formats.limits import TIMES
-from wlm.formats.reading import named_file, read_json_file
+from wlm.formats.reading import named_file, read_json_file, system_errors
 from wlm.lightmap.sheet import BASE, LIGHT, MOST_CHANNELS, MOST_NAME, MOST_SHEETS, is_group, is_name
 
 SET_FILE = "set.json"
@@ -125,9 +125,10 @@ def list_set(
     for name, own in (groups or {}).items():
         if not is_group(name) or name in found:
             raise WlmError(f"{own}: expected a group's name that is printable, without '=' and not taken, got {name!r}")
-        listings = (
-            [_alone(own)] if _is_lightmap(own) else [*_listings(own, None, layers, trust, stored is not None).values()]
-        )
+        if _is_lightmap(own):  # one lightmap, which is the same at all times
+            listings = [_of_files(own.stem, own, [own], None, times=[0.0], period=None)]
+        else:
+            listings = list(_listings(own, None, layers, trust, stored is not None).values())
         if len(listings) > 1:
             raise WlmError(f"{own}: group {name}: expected a set without groups, found one with {len(listings)}")
         found[name] = listings[0]
@@ -153,18 +154,12 @@ def _is_lightmap(path: Path) -> bool:
     return path.is_file() and path.suffix.lower() in SUFFIXES + LEVEL_SUFFIXES
 
 
-def _alone(file: Path) -> Listing:
-    """Lists one lightmap, which is the same at all times."""
-    return Listing(
-        name=file.stem,
-        where=file,
-        times=[0.0],
-        period=None,
-        layers=(LayerInfo(LIGHT.layer, LIGHT.encoding),),
-        atlases=(AtlasInfo(LIGHT.atlas, None),),
-        states=[{(LIGHT.atlas, LIGHT.layer): Source(file, file.name)}],
-        labels=[file.name],
-    )
+def _of_files(name: str, where: Path, files: Sequence[Path], mask: str | None, **timed: Any) -> Listing:
+    """Lists files of light as the only atlas; `timed` has the fields of a `Listing` about times."""
+    layers, atlases = (LayerInfo(LIGHT.layer, LIGHT.encoding),), (AtlasInfo(LIGHT.atlas, mask),)
+    states = [{(LIGHT.atlas, LIGHT.layer): Source(file, file.name)} for file in files]
+    labels = [file.name for file in files]
+    return Listing(name, where, layers=layers, atlases=atlases, states=states, labels=labels, **timed)
 
 
 def _listings(
@@ -197,15 +192,13 @@ def state_folders(folder: Path) -> list[Path]:
 
     A folder with lightmaps of other names is a plain set, whatever the folders in it contain.
     """
-    try:
+    with system_errors(f"{folder}: cannot read"):
         if _has_light(folder):
             return [folder]
         inside = sorted(folder.iterdir(), key=lambda path: natural(path.name))
         if any(path.suffix.lower() in SUFFIXES and path.is_file() for path in inside):
             return []
         return [path for path in inside if path.is_dir() and _has_light(path)]
-    except OSError as error:
-        raise WlmError(f"{folder}: cannot read: {error.strerror or error}") from error
 
 
 def _check_count(where: Path, items: Sequence[object], times: Sequence[float], noun: str) -> None:
@@ -233,24 +226,14 @@ def _timed(folder: Path, stems: Sequence[str], times: Sequence[float] | None, no
 
 def _list_folder(folder: Path, times: Sequence[float] | None, levels: bool) -> Listing:
     suffixes = SUFFIXES + LEVEL_SUFFIXES * levels
-    try:
+    with system_errors(f"{folder}: cannot read"):
         files = [f for f in folder.iterdir() if f.suffix.lower() in suffixes and f.is_file() and f.name != "mask.png"]
-    except OSError as error:
-        raise WlmError(f"{folder}: cannot read: {error.strerror or error}") from error
     # Hidden files belong to other programs: macOS writes one beside every file on a foreign disk.
     files = sorted((f for f in files if f.name[0] != "."), key=lambda f: (natural(f.name), f.name))
     if not files:
         raise WlmError(f"{folder}: expected a {SET_FILE} or lightmaps ({', '.join(SUFFIXES)}), found none of them")
-    mask = folder / "mask.png"
-    return Listing(
-        name=folder.resolve().name,
-        where=folder,
-        layers=(LayerInfo(LIGHT.layer, LIGHT.encoding),),
-        atlases=(AtlasInfo(LIGHT.atlas, str(mask) if mask.is_file() else "all"),),
-        states=[{(LIGHT.atlas, LIGHT.layer): Source(file, file.name)} for file in files],
-        labels=[file.name for file in files],
-        **_timed(folder, [f.stem for f in files], times, "lightmap"),
-    )
+    mask, timed = folder / "mask.png", _timed(folder, [f.stem for f in files], times, "lightmap")
+    return _of_files(folder.resolve().name, folder, files, str(mask) if mask.is_file() else "all", **timed)
 
 
 def _has_light(folder: Path) -> bool:

@@ -11,7 +11,6 @@ import json
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -30,6 +29,7 @@ from wlm.formats.exr import read_header, read_planes, write_planes
 from wlm.formats.exr_header import check_header
 from wlm.formats.folder import claim, read_index, write_index
 from wlm.formats.lock import is_passing
+from wlm.formats.reading import system_errors
 from wlm.smoke.camera import DIRECTIONS, EMISSION, Camera
 from wlm.smoke.flipbook.naming import six_way_channels
 from wlm.smoke.flipbook.reading import NOTE, read_flipbook
@@ -287,7 +287,7 @@ def open_frames(folder: str | os.PathLike[str], scene: Scene, *, resume: bool = 
             raise WlmError(
                 f"{folder}: cannot resume: its frames have another {field} than the scene; start anew without --resume"
             )
-    with _writing(folder):
+    with system_errors(f"{folder}: cannot write into the folder"):
         folder.mkdir(exist_ok=True)
         if not resume:
             made = (path for suffix in SUFFIXES for path in numbered(folder, "frame", suffix).values())
@@ -342,7 +342,7 @@ class NumberedFiles:
         self.partial = self.folder / f"{stem}.partial"
         # In JSON's types, which have no tuples, as they are read back.
         self._run = None if run is None else json.loads(json.dumps({**run, "wlm": __version__}))
-        with _writing(self.folder):
+        with system_errors(f"{self.folder}: cannot write into the folder"):
             made = not self.folder.exists()
             self.folder.mkdir(exist_ok=True)
             earlier = self._earlier()
@@ -363,13 +363,13 @@ class NumberedFiles:
 
     def finish(self) -> None:
         """Ends the run: removes `partial`, so that the run can no longer be resumed."""
-        with _writing(self.folder):
+        with system_errors(f"{self.folder}: cannot write into the folder"):
             self.partial.unlink(missing_ok=True)
 
     def file(self, number: int) -> Path:
         """Returns the path of a frame's result; the first call makes the folder or removes an earlier run's files."""
         if not self._cleared:
-            with _writing(self.folder):
+            with system_errors(f"{self.folder}: cannot write into the folder"):
                 self.folder.mkdir(exist_ok=True)
                 for path in self._earlier():
                     path.unlink(missing_ok=True)
@@ -474,14 +474,6 @@ def read_shaded(
     if "looks" not in note:
         return six, None
     return six, check_settings(Looks, note["looks"], f"{path}: header attribute wlm: looks.", folder=Path(path).parent)
-
-
-@contextmanager
-def _writing(folder: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise WlmError(f"{folder}: cannot write into the folder: {error.strerror or error}") from error
 
 
 def _read_scene(folder: Path) -> Scene:

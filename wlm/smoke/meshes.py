@@ -13,6 +13,7 @@ from wlm.errors import WlmError
 from wlm.formats.gltf import read_gltf
 from wlm.formats.meshes import SUFFIXES as OTHERS
 from wlm.formats.meshes import read_mesh
+from wlm.formats.reading import system_errors
 
 SUFFIXES = (".glb", ".gltf", *OTHERS)
 """Extensions of files that are read here."""
@@ -41,10 +42,8 @@ class Surface:
 def read_surface(path: str | os.PathLike[str]) -> Surface:
     """Reads all triangles of a file, whose name ends in one of `SUFFIXES`, or returns them if it has not changed.
     Raises a WlmError if the file is missing or damaged, has no triangles or more than `MOST_TRIANGLES`."""
-    try:
+    with system_errors(f"{path}: cannot read the mesh"):
         status = os.stat(path)
-    except OSError as error:
-        raise WlmError(f"{path}: cannot read the mesh: {error.strerror or error}") from error
     return _read(os.fspath(path), status.st_mtime_ns, status.st_size)
 
 

@@ -14,7 +14,7 @@ than with each state compressed alone.
 import numpy as np
 import torch
 
-from wlm.atlas.colour import encode, quantise
+from wlm.atlas.colour import quantise
 from wlm.atlas.data import LightmappedScene
 from wlm.atlas.model import BLOCK_SIDE, BLOCKS, TEXELS, AtlasModel, Profile, coarse_place, extent, pack_tiles
 from wlm.atlas.shared.allocation import Allocated
@@ -41,7 +41,8 @@ def fit_shared(scene: LightmappedScene, profile: Profile, seed: int, stages: Sta
         peak = peaks_of(scene)
         varies = variation(scene, peak, device)
         weights = scene_weights(scene, varies, profile, seed, device)
-        unit = peak * scales(varies, [_of_texels(weight) for weight in weights])
+        of_texels = [each.reshape(each.shape[0] // 2, 2, -1, 2).sum((1, 3)) for each in weights]
+        unit = peak * scales(varies, of_texels)
         planes = planes_of(scene, weights, profile.mips, device)
     kept = fitted(scene, planes, unit, varies, profile, seed, stages)
     tiles, tried, given, rows = kept.cut.tiles, kept.tried, kept.given, kept.cut.places
@@ -87,10 +88,6 @@ def fit_shared(scene: LightmappedScene, profile: Profile, seed: int, stages: Sta
     )
 
 
-def _of_texels(weight: np.ndarray) -> np.ndarray:
-    return weight.reshape(weight.shape[0] // 2, 2, -1, 2).sum((1, 3))
-
-
 def _textures(tiles: SceneTiles, tried: list[Candidate], given: Allocated) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Solves for the samples of all components and writes them to the colour textures. Returns arrays of the model by
     name, and the factor by which each component was multiplied to use the format's range, float64 [C, 3]."""
@@ -125,10 +122,10 @@ def _textures(tiles: SceneTiles, tried: list[Candidate], given: Allocated) -> tu
     scale = np.divide(_BRIGHT, largest, out=np.ones_like(largest), where=largest > 0)
     first, second = (texels * scale[number] for texels, number in zip(light, owner, strict=True))
     textures = quantise(first, TEXELS, device=tiles.device)
-    pages = [encode(page, BLOCKS, weight, tiles.device) for page, weight in zip(second, share[1], strict=True)]
+    pages = [quantise(page, BLOCKS, weight, tiles.device) for page, weight in zip(second, share[1], strict=True)]
     if pages:
-        blocks, decoded = (np.stack(each) for each in zip(*pages, strict=True))
-        textures |= {"blocks": blocks, "block_texels": decoded}
+        names = {"blocks": "blocks", "block_texels": "texels"}
+        textures |= {name: np.stack([page[part] for page in pages]) for name, part in names.items()}
     return textures, scale.astype(np.float64)
 
 

@@ -45,7 +45,7 @@ from wlm_kernels.atlas import solve as kernels
 SUPERSAMPLING = 2
 """Points per texel and axis at which a tile is fitted."""
 
-_AT_ONCE, _AT_ONCE_CUDA = 8192, 65536  # tiles
+_AT_ONCE, _AT_ONCE_CUDA = 8192, 1 << 18  # tiles
 _SHARES = tuple((k + 0.5) / SUPERSAMPLING for k in range(SUPERSAMPLING))  # weight of the second texel at a point
 # Conjugate gradient rounds from the unweighted solution: for curves, for curves of blocks, and for stored samples.
 _ROUGH, _MEDIUM, _FINE = 3, 10, 24
@@ -87,7 +87,7 @@ def fit_tiles(
     with stages("curves"):
         error = curves(tiles, sizes, stages)
     with stages("allocate"):
-        packed = layout(torch.from_numpy(error).to(grid.device), sizes, room, least_gain(grid))
+        packed = layout(error, sizes, room, least_gain(grid))
         if packed is None:
             return None
     with stages("solve"):
@@ -107,10 +107,12 @@ def composed_model(
 ) -> AtlasModel:
     """Makes the model from the tiles' solved samples, sizes and places, and numbers in the grid, int64 [T]."""
     size, mixed, code = scene.sheets[0].mask.shape, profile.colour == "mixed", first_block_code(profile.colour)
-    counts, chosen = tile_counts(*size, profile.tile), [sizes[number] for number in packed.chosen]
+    counts = tile_counts(*size, profile.tile)
+    kinds = np.array([(each.nx, each.ny, each.step > 1, each.second) for each in sizes])[packed.chosen]
+    sides = kinds[:, :2]
     images = [(torch.zeros((*shape, 3), device=device), torch.zeros(shape, device=device)) for shape in packed.shapes]
     for members, values, weight in samples:
-        each = chosen[members[0]]
+        each = sizes[packed.chosen[members[0]]]
         # Copying a large texture through the host would take seconds.
         at = tuple(torch.from_numpy(part).to(device) for part in texels_of(packed.first[members], each.nx, each.ny))
         images[each.second][0][at], images[each.second][1][at] = values, weight
@@ -127,17 +129,16 @@ def composed_model(
     total = counts[0] * counts[1]
     place, side = np.zeros((total, 2), int), np.full((total, 2), 1 if code else BLOCK_SIDE)
     blocks = np.full(total, not code)
-    place[index], side[index] = packed.first, [(each.nx, each.ny) for each in chosen]
-    blocks[index] = [each.step > 1 for each in chosen]
+    place[index], side[index], blocks[index] = packed.first, sides, kinds[:, 2]
     lut = pack_entries(place, side, blocks, code).reshape(*counts, 2)
     report = {
         "tiles": len(index),
         "of tiles": counts[0] * counts[1],
-        "samples": sum(size.nx * size.ny for size in chosen),
-        "constant tiles": sum(size.nx * size.ny == 1 for size in chosen),
+        "samples": int(sides.prod(1).sum()),
+        "constant tiles": int((sides == 1).all(1).sum()),
     }
     if mixed:
-        report["tiles of blocks"] = sum(size.second for size in chosen)
+        report["tiles of blocks"] = int(kinds[:, 3].sum())
     sheets = (SheetPlace(scene.sheets[0].name, *size, 0, 0, *counts),)
     settings = (scene.name, scene.source, profile, "tiles", profile.colour, scene.states, sheets)
     return AtlasModel(*settings, **textures, lut=lut, report=report)
@@ -289,14 +290,14 @@ def sample_weights(tiles: Tiles, nx: int, ny: int) -> torch.Tensor:
     return down.T @ tiles.weight.unflatten(1, (points, points)) @ across
 
 
-def curves(tiles: Tiles, sizes: list[Size], stages: Stages) -> np.ndarray:
-    """Returns the error of every tile at every size, float64 [sizes, T], with samples rounded as the size's format
-    stores them. The checkpoint of `stages` saves the errors at each size as one batch."""
+def curves(tiles: Tiles, sizes: list[Size], stages: Stages) -> torch.Tensor:
+    """Returns the error of every tile at every size, float64 [sizes, T] on the tiles' device, with samples rounded as
+    the size's format stores them. The checkpoint of `stages` saves the errors at each size as one batch."""
     meter, pieces = Meter(stages.progress, "curves", len(sizes)), [piece for _, piece in _pieces(tiles)]
     table = {"error": Part(np.float64, (len(tiles.index),), least=0.0)}
     columns: dict[int, list[torch.Tensor]] = {}  # those of one number of rows, which the next sizes share
 
-    def at_size(i: int, size: Size) -> dict[str, np.ndarray]:
+    def at_size(i: int, size: Size) -> dict[str, torch.Tensor]:
         if meter.due(i):
             meter.report(i)
         result, rounds = [], _ROUGH if size.step == 1 else _MEDIUM
@@ -307,11 +308,10 @@ def curves(tiles: Tiles, sizes: list[Size], stages: Stages) -> np.ndarray:
             samples = solve(piece, size.nx, size.ny, rounds, own).clamp(min=0.0)
             weight = sample_weights(piece, size.nx, size.ny) if size.step > 1 else None
             result.append(errors(piece, colour.stored(samples, weight, size.format)))
-        return {"error": torch.cat(result).cpu().numpy()}  # one copy, so that the GPU waits for the CPU once
+        return {"error": torch.cat(result)}
 
-    return np.stack(
-        [stages.batch(i, table, functools.partial(at_size, i, size))["error"] for i, size in enumerate(sizes)]
-    )
+    kept = (stages.batch(i, table, functools.partial(at_size, i, size))["error"] for i, size in enumerate(sizes))
+    return torch.stack([torch.as_tensor(error, device=tiles.index.device) for error in kept])
 
 
 def solved(tiles: Tiles, sizes: list[Size], chosen: np.ndarray) -> list[tuple[np.ndarray, torch.Tensor, torch.Tensor]]:

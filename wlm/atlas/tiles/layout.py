@@ -7,7 +7,7 @@ of a tile says which one it is in.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -153,28 +153,18 @@ def packed(
     if not len(size):
         return first, (step, step)
     pages = [np.arange(len(size))] if pages is None else pages
-    most, shelves = max(float(size[page].prod(1).sum()) for page in pages), [_Shelves(size[page]) for page in pages]
-    best = None
-    for share in _WIDTHS:
-        width = max(int(size[:, 0].max()), -(-round(share * math.sqrt(most)) // step) * step)
-        placed, heights = zip(*(each.place(width) for each in shelves), strict=True)
-        # No shelf may reach as far as the width allows.
-        widest = max(int((at + size[page])[:, 0].max(initial=0)) for at, page in zip(placed, pages, strict=True))
-        if best is None or widest * max(heights) < best[0]:
-            best = widest * max(heights), placed, (max(heights), widest)
-    for at, page in zip(best[1], pages, strict=True):
-        first[page] = at
-    return first, best[2]
+    most, shelves = max(float(size[page].prod(1).sum()) for page in pages), [Shelves(size[page]) for page in pages]
+    widths = [max(int(size[:, 0].max()), -(-round(share * math.sqrt(most)) // step) * step) for share in _WIDTHS]
+    taken = [tuple(map(max, zip(*(each.extent(width) for each in shelves), strict=True))) for width in widths]
+    shape, width = min(zip(taken, widths, strict=True), key=lambda each: math.prod(each[0]))
+    for each, page in zip(shelves, pages, strict=True):
+        first[page] = each.place(width)
+    return first, shape
 
 
-def place(sizes: np.ndarray, width: int) -> tuple[np.ndarray, int]:
-    """Packs rectangles, int [R, 2] widths and heights, on shelves (rows) `width` wide, in order of height; each shelf
-    is as high as its first rectangle. Returns x and y of each rectangle, int64 [R, 2], and the total height."""
-    return _Shelves(sizes).place(width)
-
-
-class _Shelves:
-    """Rectangles, int [R, 2], sorted for `place` by falling height and then width."""
+class Shelves:
+    """Packs rectangles, int [R, 2] widths and heights, on shelves (rows), by falling height and then width. Each shelf
+    is as high as its first rectangle."""
 
     def __init__(self, sizes: np.ndarray) -> None:
         self._order = np.lexsort((-sizes[:, 0], -sizes[:, 1]))
@@ -182,17 +172,28 @@ class _Shelves:
         starts = np.flatnonzero(np.append(True, (ordered[1:] != ordered[:-1]).any(1))[: len(sizes)])
         self._sizes, self._counts = ordered[starts], np.diff(np.append(starts, len(sizes)))
 
-    def place(self, width: int) -> tuple[np.ndarray, int]:
-        parts, x, y, height = [np.zeros((0, 2), np.int64)], 0, 0, 0
+    def place(self, width: int) -> np.ndarray:
+        """Returns x and y of each rectangle on shelves `width` wide, int64 [R, 2]."""
+        first, at = np.empty((len(self._order), 2), np.int64), 0
+        for x, y, w, h, columns, count in self._grids(width):
+            row, column = np.divmod(np.arange(count), columns)
+            first[self._order[at : at + count]] = np.stack([x + w * column, y + h * row], 1)
+            at += count
+        return first
+
+    def extent(self, width: int) -> tuple[int, int]:
+        """Returns the rows and columns of texels that the shelves take; none may reach as far as the width allows."""
+        ends = [(y + h * -(-count // n), x + w * min(n, count)) for x, y, w, h, n, count in self._grids(width)]
+        return max((row for row, _ in ends), default=0), max((column for _, column in ends), default=0)
+
+    def _grids(self, width: int) -> Iterator[tuple[int, ...]]:
+        """Yields grids of equal rectangles, in order: x and y of the first, width and height, columns, and number."""
+        x = y = height = 0
         for (w, h), count in zip(self._sizes.tolist(), self._counts.tolist(), strict=True):
             # The first ones share the last shelf with the size before; the others fill shelves of their own.
-            beside = min((width - x) // w, count) if height else 0
-            parts.append(np.stack([x + w * np.arange(beside), np.full(beside, y)], 1))
-            x += w * beside
-            if beside < count:
-                shelf, column = np.divmod(np.arange(count - beside), width // w)
-                parts.append(np.stack([w * column, y + height + h * shelf], 1))
-                x, y, height = w * (int(column[-1]) + 1), int(parts[-1][-1, 1]), h
-        first = np.empty((len(self._order), 2), np.int64)
-        first[self._order] = np.concatenate(parts)
-        return first, y + height
+            if beside := min((width - x) // w, count) if height else 0:
+                yield x, y, w, h, beside, beside
+            x, rest, columns = x + w * beside, count - beside, width // w
+            if rest:
+                yield 0, y + height, w, h, columns, rest
+                x, y, height = w * ((rest - 1) % columns + 1), y + height + h * ((rest - 1) // columns), h
