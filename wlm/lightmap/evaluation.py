@@ -247,8 +247,7 @@ def _lost_light(model: SheetModel, lightmaps: SheetFrames, device: str) -> list[
 
     def doubtful(i: int) -> list[tuple[int, tuple[slice, slice]]]:
         inside, frame = mask & lightmaps.valid(i), lightmaps.frames[i]
-        light = np.maximum(np.maximum(frame[..., 0], frame[..., 1]), frame[..., 2])
-        return [at for at in _windows(model) if _may_hide_loss(light[at[1]][inside[at[1]]])]
+        return [at for at in _windows(model) if _may_hide_loss(frame[at[1]], inside[at[1]])]
 
     chosen = list(each(doubtful, times))
     if not any(chosen):
@@ -262,9 +261,11 @@ def _lost_light(model: SheetModel, lightmaps: SheetFrames, device: str) -> list[
         for start in range(0, len(chosen[i]), _TILES_AT_ONCE):
             some = chosen[i][start : start + _TILES_AT_ONCE]
             for (tile, window), decoded in zip(some, decoder.tiles([tile for tile, _ in some], stamp), strict=True):
-                valid = inside[window]
-                inner = decoded[: valid.shape[0], : valid.shape[1]][valid]
-                own.add(frame[window][valid], inner, _place(tile, stamp))
+                part = frame[window]
+                both = part, decoded[: part.shape[0], : part.shape[1]]
+                # A mask as the index would take six times as long and hold Python's lock.
+                valid = np.flatnonzero(inside[window])
+                own.add(*(texels.reshape(-1, 3).take(valid, 0) for texels in both), _place(tile, stamp))
         return own
 
     with interop.one_thread():
@@ -273,8 +274,9 @@ def _lost_light(model: SheetModel, lightmaps: SheetFrames, device: str) -> list[
     return lost.warnings(model.name, *_LOST)
 
 
-def _may_hide_loss(light: np.ndarray) -> bool:
-    """Returns whether PSNR may hide lost light among these valid texels of a tile, float32 [K]."""
+def _may_hide_loss(colour: np.ndarray, valid: np.ndarray) -> bool:
+    """Returns whether PSNR may hide lost light in a tile, float32 [h, w, 3], among its valid texels, bool [h, w]."""
+    light = np.maximum(np.maximum(colour[..., 0], colour[..., 1]), colour[..., 2])[valid]
     if not len(light) or not (largest := light.max()) > 0:
         return False
     few = np.count_nonzero(2.0 * light >= largest) <= _FEW_TEXELS < len(light)
