@@ -144,8 +144,8 @@ def test_vertices_are_gathered_and_all_else_stays(tmp_path):
     colour = new["accessors"][primitive["attributes"]["COLOR_0"]]
     assert colour["normalized"] is True and colour["componentType"] == 5121
     np.testing.assert_array_equal(components(after, primitive["attributes"]["TEXCOORD_1"], "VEC2"), NEW_UV)
-    after = components(after, primitive["targets"][0]["POSITION"], "VEC3")
-    np.testing.assert_array_equal(after, POINTS[ROWS[GATHER]] * 2)
+    moved = components(after, primitive["targets"][0]["POSITION"], "VEC3")
+    np.testing.assert_array_equal(moved, POINTS[ROWS[GATHER]] * 2)
     np.testing.assert_array_equal(components(after, primitive["indices"], "SCALAR").reshape(-1, 3), CORNERS)
     assert (primitive["material"], primitive["mode"]) == (0, 4)
     assert primitive["extras"] == {"keep": [1, {"me": None}]}
