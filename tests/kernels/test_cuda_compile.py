@@ -45,11 +45,11 @@ FLOATS = (wp.float16, wp.float32)
 LATENTS = (1, 9, 12, 32)
 LATTICE_STEPS = (
     {"lattice": "D3Q19", "solids": True, "walls": (True, True, True)},
-    {"lattice": "D3Q19", "solids": True, "storage": "float16"},
+    {"lattice": "D3Q19", "solids": True, "storage": "float16", "group": 2},
     {"lattice": "D3Q19", "forced": True},
     {"lattice": "D3Q27", "solids": True, "forced": True},
     {"lattice": "D3Q27", "storage": "float16", "eddies": False},
-    {"lattice": "D3Q19", "solids": True, "storage": "float16", "in_place": True},
+    {"lattice": "D3Q19", "solids": True, "storage": "float16", "in_place": True, "group": 2},
     {"lattice": "D2Q9"},
 )
 
@@ -82,9 +82,9 @@ def _probe_network(shape: tuple[int, int, int]) -> list:
 def _smoke(dtype: type) -> list:
     """Builds all kernels that take smoke, for densities of one type."""
     smoke = smoke_march.smoke_struct(dtype, True)
-    variants = {"_guide": (True,), "_coarse": (dtype is wp.float16,), "_measure": (2,)}
-    built = [smoke_march.occupied_kernel(dtype), smoke_path._coarser, *map(depth_lattice._add_up, BOTH)]
-    for module in (marches, march_six, depth_lattice, diffusion, smoke_path):
+    variants = {"_guide": (True,), "_coarse": (dtype is wp.float16,), "_measure": (2,), "_mark": (32,), "_mean": (4, 8)}
+    built = [smoke_path._coarser, *(depth_lattice._add_up(solid, 4) for solid in BOTH)]
+    for module in (smoke_march, marches, march_six, depth_lattice, diffusion, smoke_path):
         # Functions of Warp have a `build`, too.
         built_by = {name: value for name, value in vars(module).items() if not isinstance(value, wp.Function)}
         launchers = {name: value.build for name, value in built_by.items() if hasattr(value, "build")}

@@ -101,7 +101,8 @@ def test_muon_moves_layers_along_their_orthogonal_momentum(device: str, hidden: 
     gather.turn(hidden, rates, array(momentum.astype(np.float32).ravel(), float, device), weights)
     want = np.stack([_turn(each, 0.5) for each in momentum.astype(np.float32)])
     # A GPU's operands are half floats.
-    np.testing.assert_allclose(weights.numpy().reshape(start.shape) - start, want, atol=2e-5 if device == "cpu" else 0.01)
+    moved = weights.numpy().reshape(start.shape) - start
+    np.testing.assert_allclose(moved, want, atol=2e-5 if device == "cpu" else 0.01)
     fit = trainer(Case(hidden=hidden, settings={"muon": True, "net_rate": 0.01}), device)
     start = fit.hidden.cpu().numpy().copy()
     grads = fused_step(fit, False).grads["hidden"]

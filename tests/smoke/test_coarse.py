@@ -131,6 +131,9 @@ def test_empty_bricks_change_nothing(device: str, monkeypatch):
     monkeypatch.setattr(marches, "BRICK", 0)
     torch.testing.assert_close(_planes(volume, camera, step=1.5), skipped, rtol=0, atol=1e-6)
     assert len(made) == 1
+    # A volume need not be contiguous.
+    turned = replace(volume, density=volume.density.mT.contiguous().mT)
+    torch.testing.assert_close(_planes(turned, camera, step=1.5), skipped, rtol=0, atol=1e-6)
 
 
 def _shifts(seed: int, device: str, size: int = 64, jitter: float = 1.0) -> torch.Tensor:

@@ -14,6 +14,7 @@ from benchmarks.smoke_tracing import trace
 from demos.plume import make_plume
 from wlm.fluid.volume import DensityVolume, from_array
 from wlm.smoke.camera import Camera, unit
+from wlm.smoke.march.launch import in_bricks
 from wlm.smoke.shading import Light, PointLight, Ramp, half_sphere
 from wlm.smoke.transport.diffusion import CoarseSmoke, share_of
 from wlm.smoke.transport.lighting import light_smoke, marching
@@ -55,6 +56,21 @@ def test_of_the_light_that_smoke_stops_no_cell_loses_any(device: str):
             inside = np.minimum(np.where(ways > 0, high, low) / ways, 1e9).min(1)
             share = float(1 - np.exp(-0.01 * inside).mean())
         assert found == pytest.approx(share, rel=0.02)
+
+
+def test_cells_have_the_mean_of_their_voxels(device: str):
+    """A voxel that two cells share counts for each by its part in it; bricks without smoke may be hot."""
+    volume = in_bricks(plume(hot=True, device=device))
+    coarse = CoarseSmoke(volume, 7)
+    shares = []
+    for n, count in zip(volume.shape, coarse.extinction.shape, strict=True):
+        edges = np.arange(count + 1) * n / count
+        low, high = np.maximum(np.arange(n)[:, None], edges[:-1]), np.minimum(np.arange(1, n + 1)[:, None], edges[1:])
+        shares.append(np.maximum(high - low, 0.0) * count / n)
+    mean = coarse.extinction / (volume.extinction * volume.voxel)
+    for found, voxels in ((mean, volume.density), (coarse.mean(hot=True), volume.temperature)):
+        expected = np.einsum("xyz,xi,yj,zk->ijk", voxels.cpu().double().numpy(), *shares)
+        np.testing.assert_allclose(found.cpu().numpy(), expected, rtol=1e-5, atol=1e-6 * expected.max())
 
 
 def stopped_by_cells(coarse: CoarseSmoke, volume: DensityVolume, lights: Sequence[Light]) -> torch.Tensor:

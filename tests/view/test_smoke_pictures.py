@@ -35,7 +35,6 @@ def _ball(x=0.0, y=0.0, z=0.0, radius=0.2, **more):
 def draw_obstacles(obstacles, camera, lights, device):
     """Returns the light and the distance of the obstacles alone."""
     drawing = Drawing(camera, lights, obstacles=obstacles, device=device)
-    drawing.draw_obstacles()
     return drawing.solid_light, drawing.solid_depth
 
 

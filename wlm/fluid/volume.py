@@ -92,6 +92,8 @@ class DensityVolume:
         places: int32 tensor [X / 8, Y / 8, Z / 8], rounded up, numbers of bricks of 8^3 voxels: density and temperature
             are then [N, 8, 8, 8], with 0 in brick 0. None: all voxels are stored.
         cells: X, Y and Z of a volume with `places`.
+        near: uint8 tensor like `places`, 1 where a brick, or a voxel next to it, has smoke, else 0. None: each march
+            finds these bricks, see `wlm.smoke.march.launch.in_bricks`.
         solid: Obstacles for marches that light the smoke, see `wlm.view.smoke.Drawing.among`.
     """
 
@@ -105,6 +107,7 @@ class DensityVolume:
     warnings: tuple[str, ...] = ()
     places: torch.Tensor | None = None
     cells: tuple[int, int, int] | None = None
+    near: torch.Tensor | None = None
     solid: "Solid | None" = None
 
     @property
@@ -144,9 +147,10 @@ class DensityVolume:
             yield slab[: self.shape[0] - EDGE * x, : self.shape[1], : self.shape[2]]
 
     def arrays(self) -> tuple[wp.array, wp.array | None]:
-        """Returns density and temperature as Warp arrays of three axes that share the tensors' memory."""
-        hot = None if self.temperature is None else to_warp(self.temperature.flatten(0, -3))
-        return to_warp(self.density.flatten(0, -3)), hot
+        """Returns density and temperature as contiguous Warp arrays of three axes, which share the tensors' memory if
+        these are contiguous."""
+        hot = None if self.temperature is None else to_warp(self.temperature.flatten(0, -3).contiguous())
+        return to_warp(self.density.flatten(0, -3).contiguous()), hot
 
 
 def from_array(

@@ -30,7 +30,8 @@ class Drawing:
     of the smoke's surface, and shadows this surface. Smoke that a march lights `among` the obstacles is shadowed in
     its depth, also from point lights, and ends at them. Point lights do not light obstacles.
 
-    `move` sets the positions of the obstacles. A call then only launches kernels, so on CUDA a graph can capture it.
+    `move` sets the positions of the obstacles, at first those of time 0, and draws the obstacles alone. A call then
+    only launches kernels, so on CUDA a graph can capture it.
 
     Attributes:
         image: float32 [H, W, 3], linear, the last picture.
@@ -94,32 +95,29 @@ class Drawing:
                 colours = np.array([obstacle.colour for obstacle in obstacles], np.float32)
                 tints = wp.array(colours, dtype=wp.vec3, device=device)
                 self._solids = kernels.Solids(mesh, wp.array(owner, dtype=wp.int32, device=device), tints)
+                self._draw_obstacles()
 
     def move(self, time: float) -> None:
-        """Moves the obstacles to their positions at a time in seconds."""
+        """Moves the obstacles to their positions at a time in seconds, and draws them there."""
         if any(obstacle.eased.moves for obstacle in self._obstacles):
             with stream(self._device):
                 self._solids.mesh.points.assign(self._mesh_at(time)[0])
                 self._solids.mesh.refit()
+                self._draw_obstacles()
 
     def _mesh_at(self, time: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Returns the obstacles as `obstacle_mesh` does, relative to the camera, so that float32 is exact enough."""
         points, triangles, owner = obstacle_mesh(self._obstacles, time)
         return (points - np.asarray(self._camera.position)).astype(np.float32), triangles, owner
 
-    def draw_obstacles(self) -> None:
-        """Draws the obstacles at their current positions into `solid_light` and `solid_depth`."""
-        if not self._obstacles:
-            return
-        with stream(self._device):
-            out = to_warp(self.solid_light, wp.vec3), to_warp(self.solid_depth)
-            kernels.light_solids(self._solids, self._as_lamps(), _AMBIENT, self._camera.in_world(), *out)
+    def _draw_obstacles(self) -> None:
+        out = to_warp(self.solid_light, wp.vec3), to_warp(self.solid_depth)
+        kernels.light_solids(self._solids, self._as_lamps(), _AMBIENT, self._camera.in_world(), *out)
 
     def among(self, volume: DensityVolume) -> DensityVolume:
-        """Draws the obstacles, and returns the volume with them for marches that light it; they follow `move`."""
+        """Returns the volume with the obstacles for marches that light it; they follow `move`."""
         if not self._obstacles:
             return volume
-        self.draw_obstacles()
         solid = Solid()
         solid.mesh, solid.voxel, solid.stop = self._solids.mesh.id, volume.voxel, to_warp(self.solid_depth)
         solid.corner = wp.vec3(*(np.asarray(volume.origin) - self._camera.position))
@@ -151,7 +149,6 @@ class Drawing:
             if self._obstacles:
                 surface = self.solid_depth  # lit smoke ends there, so that no obstacle is before it
                 if six is not None:
-                    self.draw_obstacles()
                     self.draw_shadows(seen.depth)
                     surface = seen.depth.contiguous()
                 solids = to_warp(surface), to_warp(self.solid_light, wp.vec3), to_warp(self.solid_depth)

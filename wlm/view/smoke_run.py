@@ -11,6 +11,7 @@ from wlm.fluid.volume import DensityVolume
 from wlm.interop import StepGraph
 from wlm.smoke.camera import Camera
 from wlm.smoke.lightmaps import SixWay
+from wlm.smoke.march.launch import in_bricks
 from wlm.smoke.march.six_way import guide
 from wlm.smoke.network.prediction import SmokePredictor, predict
 from wlm.smoke.scene import Scene, make_camera
@@ -44,6 +45,7 @@ class Lighting:
     def __call__(self, volume: DensityVolume, camera: Camera, lights: Sequence[AnyLight]) -> SixWay | ScatteredSmoke:
         """Lights the smoke on its device. Lightmaps are made of smoke without obstacles, and include the depth of its
         surface, on which a `Drawing` draws their shadows."""
+        volume = in_bricks(volume)
         if self.albedo is not None:
             return scatter(volume, camera, lights, self.albedo)
         six = predict(volume, camera, self.network)

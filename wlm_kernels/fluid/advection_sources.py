@@ -103,8 +103,8 @@ def strength(region: Region, p: wp.vec3i) -> float:
 @functools.cache
 def source_kernels(stored: type) -> dict[str, wp.Kernel]:
     """Builds (once) the kernels for smoke stored as `wp.float32` or `wp.float16`, by their names: "source" has a thread
-    for each fine cell of a box, "cover" for each coarse cell, "lift" for each of a slab, "store" for each cell of a
-    brick and group.
+    for each fine cell of a box, "cover" some for each coarse cell, "lift" one for each of a slab, "store" for each cell
+    of a brick and group.
     """
     fields_type = fields_struct(stored)
 
@@ -149,16 +149,17 @@ def source_kernels(stored: type) -> dict[str, wp.Kernel]:
         before: wp.array1d[wp.uint8],
         after: wp.array1d[wp.uint8],
         bricks: Bricks,
+        lanes: int,
         # in, out:
         fields: fields_type,
     ):
-        i = wp.tid()
+        i, lane = wp.tid()
         was_solid = before[i] == SOLID
         if was_solid == (after[i] == SOLID):
             return
         coarse = cell_of(box.coarse, i)
         r = box.refinement
-        for k in range(r * r * r):
+        for k in range(lane, r * r * r, lanes):
             inner = cell_of(wp.vec3i(r, r, r), k)
             p = wp.vec3i(coarse[0] * r + inner[0], coarse[1] * r + inner[1], coarse[2] * r + inner[2])
             smoke = float(0.0)
@@ -256,7 +257,7 @@ def source_kernels(stored: type) -> dict[str, wp.Kernel]:
     return {"source": source, "cover": cover, "lift": lift, "store": store}
 
 
-def _launch(name: str, size: int, inputs: list, output, fields: Fields) -> None:
+def _launch(name: str, size: int | tuple[int, int], inputs: list, output, fields: Fields) -> None:
     kernel = source_kernels(fields.density.dtype)[name]
     wp.launch(kernel, size, inputs=inputs, outputs=[output], device=fields.density.device)
 
@@ -334,7 +335,9 @@ def change_solids(box: Box, before: wp.array, after: wp.array, fields: Fields, b
     `before` and `after` are marks of solid cells, uint8 [coarse cells], from `advection_places.mark_walls`. Bricks that
     receive smoke, which must be stored, are marked as busy.
     """
-    _launch("cover", before.shape[0], [box, before, after, bricks], fields.arrays, fields)
+    # On a GPU one thread would take long for all fine cells of a coarse one.
+    lanes = box.refinement**2 if before.device.is_cuda else 1
+    _launch("cover", (before.shape[0], lanes), [box, before, after, bricks, lanes], fields.arrays, fields)
 
 
 def buoyancy(

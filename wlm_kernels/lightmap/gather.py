@@ -159,7 +159,13 @@ for _scalar in (float, wp.int64):
 
 
 def update(
-    *arguments: Any, frozen: bool = False, levels: bool = False, clear: bool, turned: int = 0, lane: int = 0, lanes: int = 1
+    *arguments: Any,
+    frozen: bool = False,
+    levels: bool = False,
+    clear: bool,
+    turned: int = 0,
+    lane: int = 0,
+    lanes: int = 1,
 ) -> None:
     """Converts sums into gradients, updates the parameters with Adam and running means of losses, and counts the step.
 

@@ -26,6 +26,7 @@ from wlm_kernels.smoke.march import (
     clip,
     for_smoke,
     sample,
+    store_node,
     way_to_solid,
 )
 from wlm_kernels.smoke.settings import March
@@ -36,6 +37,7 @@ voxels."""
 
 _MOST_MARCHING = 2**24  # largest number of nodes of a point light, each of which marches separately
 _AT_ONCE = wp.constant(8)  # nodes of a line that a thread sums at a time
+_PARTS = 4  # parts of a line, which as many threads sum
 _LEAST_SPACING = 0.25  # voxels between nodes
 _DEEPEST = wp.constant(60000.0)  # largest optical depth between nodes, within the range of half floats
 _NEVER = wp.constant(1.0e30)
@@ -97,9 +99,37 @@ def _on_line(pair: int, line: int, n: int, k: int) -> wp.vec4i:
     return wp.vec4i(pair, wp.where(pair == 0, n, line), wp.where(pair == 0, line, n), k)
 
 
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return __shfl_sync(0xffffffffu, value, lane);
+#else
+    return value;
+#endif
+""")
+def _of_lane(value: wp.float64, lane: int) -> wp.float64: ...
+
+
+@wp.func_native("return (float)gaps.data[n];")
+def _gap(gaps: wp.array4d[wp.float16], n: int) -> float: ...
+
+
+@wp.func
+def _gaps(gaps: wp.array4d[wp.float16], start: int, step: int, n: int, end: int) -> _Several:
+    """Returns several gaps of a line from its n-th on, 0 from `end` on."""
+    several = _Several()
+    for m in range(_AT_ONCE):
+        # The load has no branch, so that all loads are issued at once.
+        several[m] = _gap(gaps, start + step * wp.max(wp.min(n + m, end - 1), 0))
+    for m in range(_AT_ONCE):
+        several[m] = wp.where(n + m < end, several[m], 0.0)
+    return several
+
+
 # With obstacles in the way the kernel has far more registers.
 @functools.cache
-def _add_up(with_solid: bool) -> wp.Kernel:
+def _add_up(with_solid: bool, parts: int) -> wp.Kernel:
+    beside = 32 // parts if parts > 1 else 1
+
     @wp.kernel(module="unique", module_options=OPTIONS)
     def kernel(
         # in:
@@ -109,38 +139,50 @@ def _add_up(with_solid: bool) -> wp.Kernel:
         # out:
         nodes: wp.array4d[wp.vec2],
     ):
-        """Sums optical depths from each node of a line to both of its ends; the light is beyond the last node."""
-        pair, line, k = wp.tid()
+        """Sums optical depths from each node of a line to both of its ends; the light is beyond the last node. A warp
+        has all parts of some lines that are beside each other, and a thread one part."""
+        pair, line, group, lane = wp.tid()
         last = wp.where(pair == 0, nodes.shape[1], nodes.shape[2]) - 1
         if line >= wp.where(pair == 0, nodes.shape[2], nodes.shape[1]):
             return
+        part = lane // wp.static(beside)
+        first = lane % wp.static(beside)
+        k = wp.min(group * wp.static(beside) + first, nodes.shape[3] - 1)
         # Nodes farther from the last node, and from the first one, are in the shadow of obstacles.
         lit = float(_NEVER)
         opposite = float(_NEVER)
         if wp.static(with_solid):
-            gap = wp.where(pair == 0, lattice.gap[0], lattice.gap[1])
-            lit = _lit_way(solid, _on_line(pair, line, last, k), lattice, axis(lattice, pair)) / gap
-            opposite = _lit_way(solid, _on_line(pair, line, 0, k), lattice, -axis(lattice, pair)) / gap
-        # In double precision, since the depth ahead is a difference. Several nodes at a time, since loads wait for
-        # earlier stores.
-        ahead = wp.float64(0.0)
-        for n in range(last):
-            q = _on_line(pair, line, n, k)
-            ahead += wp.float64(gaps[q[0], q[1], q[2], q[3]])
+            if part == 0:
+                gap = wp.where(pair == 0, lattice.gap[0], lattice.gap[1])
+                lit = _lit_way(solid, _on_line(pair, line, last, k), lattice, axis(lattice, pair)) / gap
+                opposite = _lit_way(solid, _on_line(pair, line, 0, k), lattice, -axis(lattice, pair)) / gap
+            lit = float(_of_lane(wp.float64(lit), first))
+            opposite = float(_of_lane(wp.float64(opposite), first))
+        q = _on_line(pair, line, 0, k)
+        start = ((pair * nodes.shape[1] + q[1]) * nodes.shape[2] + q[2]) * nodes.shape[3] + k
+        step = nodes.shape[3] * wp.where(pair == 0, nodes.shape[2], 1)
+        length = last // wp.static(parts) + 1
+        begin = part * length
+        end = wp.min(begin + length, last + 1)
+        # In double precision, since the depth ahead is a difference.
+        own = wp.float64(0.0)
+        for n in range(begin, end, _AT_ONCE):
+            several = _gaps(gaps, start, step, n, wp.min(end, last))
+            for m in range(_AT_ONCE):
+                own += wp.float64(several[m])
+        ahead = own
         behind = wp.float64(0.0)
-        for begin in range(0, last + 1, _AT_ONCE):
-            several = _Several()
+        for n in range(1, wp.static(parts)):
+            later = _of_lane(own, (lane + n * wp.static(beside)) % 32)
+            ahead += wp.where(part + n < wp.static(parts), later, wp.float64(0.0))
+            behind += wp.where(part + n < wp.static(parts), wp.float64(0.0), later)
+        for n in range(begin, end, _AT_ONCE):
+            several = _gaps(gaps, start, step, n, wp.min(end, last))
             for m in range(_AT_ONCE):
-                if begin + m < last:
-                    q = _on_line(pair, line, begin + m, k)
-                    several[m] = float(gaps[q[0], q[1], q[2], q[3]])
-            for m in range(_AT_ONCE):
-                n = begin + m
-                if n <= last:
-                    q = _on_line(pair, line, n, k)
-                    a = float(ahead) + wp.where(float(last - n) > lit, _DARK, 0.0)
-                    b = float(behind) + wp.where(float(n) > opposite, _DARK, 0.0)
-                    nodes[q[0], q[1], q[2], q[3]] = wp.vec2(a, b)
+                if n + m < end:
+                    a = float(ahead) + wp.where(float(last - n - m) > lit, _DARK, 0.0)
+                    b = float(behind) + wp.where(float(n + m) > opposite, _DARK, 0.0)
+                    store_node(nodes, start + step * (n + m), wp.vec2(a, b))
                     ahead -= wp.float64(several[m])
                     behind += wp.float64(several[m])
 
@@ -257,8 +299,10 @@ def add_up(medium: Medium, lattice: Lattice, counts: Sequence[int], pairs: int, 
     gaps, nodes = (medium.buffer((pairs, *counts), dtype) for dtype in (wp.float16, wp.vec2))
     _measure(medium, tuple(counts), [lattice, parts], [gaps], pairs)
     lines = max(counts[:2]) if pairs == 2 else counts[1]
-    inputs = [gaps, lattice, medium.solid or Solid()]
-    wp.launch(_add_up(medium.solid is not None), (pairs, lines, counts[2]), inputs, [nodes], device=medium.device)
+    # A GPU needs more threads than there are lines.
+    parts, lanes = (_PARTS, 32) if medium.device.is_cuda else (1, 1)
+    inputs, size = [gaps, lattice, medium.solid or Solid()], (pairs, lines, -(-counts[2] * parts // lanes), lanes)
+    wp.launch(_add_up(medium.solid is not None, parts), size, inputs, [nodes], device=medium.device)
     return nodes
 
 

@@ -16,6 +16,7 @@ import warp as wp
 
 from wlm_kernels.smoke.depth_lattice import Lattice, depths_at
 from wlm_kernels.smoke.march import (
+    BRICK,
     OPTIONS,
     MarchParameters,
     Medium,
@@ -25,13 +26,18 @@ from wlm_kernels.smoke.march import (
     between_nodes,
     box_of,
     for_smoke,
+    has_smoke,
+    in_tiles,
     look,
     parameters,
     pass_step,
+    pixel_of,
     sample,
     steps_along,
+    voxel,
     way_to_solid,
 )
+from wlm_kernels.smoke.naf_block import lane_sum
 from wlm_kernels.smoke.settings import March
 
 wp.set_module_options(OPTIONS)
@@ -43,6 +49,7 @@ _FIRST = 3  # rounds on the coarsest grid
 _RAYS = 4096  # rays from a point light
 _LEAST = 1e-5  # share of a ray's light below which it ends
 _TURN = wp.constant(2.399963229728653)  # the golden angle
+_FLUENCES = wp.constant(4)  # fluences that share a ray
 _PARTS = 4  # largest number of samples of a cell along an axis for direct light
 
 
@@ -146,33 +153,78 @@ def _relax(
 
 
 @wp.func
-def _overlap(cell: int, cells: int, fine: int, fines: int) -> float:
-    """Computes the share of a cell of a coarse grid that a cell of the finer grid covers, along one axis."""
-    each = float(fines) / float(cells)
-    low = wp.max(float(cell) * each, float(fine))
-    high = wp.min(float(cell + 1) * each, float(fine + 1))
-    return wp.max(high - low, 0.0) / each
+def _covered(low: float, high: float, i: int) -> float:
+    return wp.max(wp.min(high, float(i) + 1.0) - wp.max(low, float(i)), 0.0)
+
+
+@for_smoke
+def _mean(smoke_type: Any, rows: int, length: int) -> wp.Kernel:
+    field_type = smoke_type.vars["density"].type
+
+    @wp.kernel(module="unique", module_options=OPTIONS)
+    def kernel(
+        # in:
+        smoke: smoke_type,
+        field: field_type,
+        cell: wp.vec3,
+        # out:
+        out: wp.array3d[float],
+    ):
+        """Averages a field over each cell. A warp has a cell; of each brick its threads have rows along z."""
+        i, j, k, lane = wp.tid()
+        low = wp.cw_mul(wp.vec3(float(i), float(j), float(k)), cell)
+        high = low + cell
+        first = wp.vec3i(int(low[0]), int(low[1]), int(low[2]))
+        end = wp.vec3i()
+        for a in range(3):
+            end[a] = wp.min(int(wp.ceil(high[a])), smoke.cells[a])
+        total = float(0.0)
+        for a in range(first[0] // BRICK, (end[0] - 1) // BRICK + 1):
+            for b in range(first[1] // BRICK, (end[1] - 1) // BRICK + 1):
+                for c in range(first[2] // BRICK, (end[2] - 1) // BRICK + 1):
+                    if has_smoke(smoke, float(BRICK) * wp.vec3(float(a), float(b), float(c))):
+                        x0 = wp.max(BRICK * a, first[0])
+                        y0 = wp.max(BRICK * b, first[1]) + lane // wp.static(length)
+                        z0 = wp.max(BRICK * c, first[2]) + lane % wp.static(length)
+                        for z in range(z0, wp.min(BRICK * (c + 1), end[2]), wp.static(length)):
+                            for y in range(y0, wp.min(BRICK * (b + 1), end[1]), wp.static(rows)):
+                                row = float(0.0)
+                                for x in range(x0, wp.min(BRICK * (a + 1), end[0])):
+                                    row += _covered(low[0], high[0], x) * voxel(field, smoke, x, y, z)
+                                total += _covered(low[1], high[1], y) * _covered(low[2], high[2], z) * row
+        total = lane_sum(total, wp.static(rows * length))
+        if lane == 0:
+            out[i, j, k] = total / (cell[0] * cell[1] * cell[2])
+
+    return kernel
+
+
+def mean(medium: Medium, field: wp.array, cell: wp.vec3, out: wp.array) -> None:
+    """Computes the mean of the smoke's density or temperature, `field`, over each cell of a coarse grid, `out`, float
+    [X, Y, Z], whose cells have the edges `cell` in voxels. Bricks that `medium` knows as empty count as 0."""
+    rows, length = (4, 8) if medium.device.is_cuda else (1, 1)
+    _mean(medium, (*out.shape, rows * length), [field, cell], [out], rows, length)
 
 
 @wp.kernel
 def _coarsen(
     # in:
     fine: wp.array4d[float],
+    edges: wp.vec3,
     # out:
     out: wp.array4d[float],
 ):
+    """Averages over cells whose edges are 1 to 2 cells of the finer grid."""
     n, i, j, k = wp.tid()
-    nx = fine.shape[1]
-    ny = fine.shape[2]
-    nz = fine.shape[3]
+    low = wp.cw_mul(wp.vec3(float(i), float(j), float(k)), edges)
+    high = low + edges
     total = float(0.0)
-    for x in range((i * nx) / out.shape[1], wp.min(((i + 1) * nx - 1) / out.shape[1] + 1, nx)):
-        a = _overlap(i, out.shape[1], x, nx)
-        for y in range((j * ny) / out.shape[2], wp.min(((j + 1) * ny - 1) / out.shape[2] + 1, ny)):
-            b = a * _overlap(j, out.shape[2], y, ny)
-            for z in range((k * nz) / out.shape[3], wp.min(((k + 1) * nz - 1) / out.shape[3] + 1, nz)):
-                total += b * _overlap(k, out.shape[3], z, nz) * fine[n, x, y, z]
-    out[n, i, j, k] = total
+    for x in range(int(low[0]), wp.min(int(wp.ceil(high[0])), fine.shape[1])):
+        for y in range(int(low[1]), wp.min(int(wp.ceil(high[1])), fine.shape[2])):
+            share = _covered(low[0], high[0], x) * _covered(low[1], high[1], y)
+            for z in range(int(low[2]), wp.min(int(wp.ceil(high[2])), fine.shape[3])):
+                total += share * _covered(low[2], high[2], z) * fine[n, x, y, z]
+    out[n, i, j, k] = total / (edges[0] * edges[1] * edges[2])
 
 
 @wp.func
@@ -210,9 +262,10 @@ def spread(
         counts, edges = grids[-1][1].shape[1:], grids[-1][2]
         fewer = tuple((n + 1) // 2 for n in counts)
         made = [medium.buffer((count, *fewer), float) for count in (1, source.shape[0])]
+        times = wp.vec3(*(n / m for n, m in zip(counts, fewer, strict=True)))
         for fine, coarse in zip(grids[-1], made, strict=False):
-            wp.launch(_coarsen, coarse.shape, [fine], [coarse], device=device)
-        grids.append((*made, wp.vec3(*(edge * n / m for edge, n, m in zip(edges, counts, fewer, strict=True)))))
+            wp.launch(_coarsen, coarse.shape, [fine, times], [coarse], device=device)
+        grids.append((*made, wp.cw_mul(edges, times)))
     before = None
     for number, (thickness, stopped, edges) in reversed(list(enumerate(grids))):
         found = medium.buffer((light.shape[0], *stopped.shape[1:]), float) if number else light
@@ -364,24 +417,33 @@ def _gather(smoke_type: Any) -> wp.Kernel:
         out: wp.array4d[float],
         thin: wp.array2d[float],
     ):
-        n, row, column = wp.tid()
+        several, a, b, lane = wp.tid()
+        row, column = pixel_of(a, b, lane)
+        if row >= view.height or column >= view.width:
+            return
+        first = several * _FLUENCES
         r = begin(view, row, column, smoke, march.step, 0.5)
-        total = float(0.0)
-        from_thin = float(0.0)
+        total = wp.vec4()
+        from_thin = wp.vec4()
         opacity = float(0.0)
         while r.done < r.count:
             r = look(r, smoke)
             if r.x > 0.0:
-                here = between_nodes(light[n], wp.cw_div(r.place, cell) - wp.vec3(0.5, 0.5, 0.5))
+                q = wp.cw_div(r.place, cell) - wp.vec3(0.5, 0.5, 0.5)
                 share = r.t * absorbed(r.x)
                 clear = share * wp.exp(-r.sigma * wp.min(cell))
-                total += share * here
-                from_thin += clear * here
+                for n in range(_FLUENCES):
+                    if first + n < light.shape[0]:
+                        here = between_nodes(light[first + n], q)
+                        total[n] += share * here
+                        from_thin[n] += clear * here
                 opacity += clear
             r = pass_step(r, march.cutoff)
-        out[0, n, row, column] = total / (4.0 * wp.pi)
-        out[1, n, row, column] = from_thin / (4.0 * wp.pi)
-        if n == 0:
+        for n in range(_FLUENCES):
+            if first + n < light.shape[0]:
+                out[0, first + n, row, column] = total[n] / (4.0 * wp.pi)
+                out[1, first + n, row, column] = from_thin[n] / (4.0 * wp.pi)
+        if several == 0:
             thin[row, column] = opacity
 
     return kernel
@@ -426,4 +488,5 @@ def gather(
             transparency that a cell of its density has.
         thin: float [H, W], written: the opacity of thin smoke, weighted in the same way.
     """
-    _gather(medium, out.shape[1:], [view, parameters(march), cell, light], [out, thin])
+    size = (-(-light.shape[0] // int(_FLUENCES)), *in_tiles(*thin.shape))
+    _gather(medium, size, [view, parameters(march), cell, light], [out, thin])

@@ -35,6 +35,7 @@ OPTIONS = {"enable_backward": False}
 """Options of every module of smoke kernels."""
 
 _NEVER = wp.constant(1.0e30)
+_Eight = wp.types.vector(length=8, dtype=float)
 _SEEDS = 2**32
 _PATTERNS = wp.constant(64)  # number of patterns of the gradient noise, a power of 2
 
@@ -75,13 +76,13 @@ def smoke_struct(dtype: Any, in_bricks: bool, stored: bool = False) -> Any:
 
 @dataclass(frozen=True)
 class Medium:
-    """Smoke on a device: density, float or half [X, Y, Z], and extinction per voxel at density 1; temperature in an
-    array like the density's, None for smoke without light, and light emitted per voxel at temperature 1.
+    """Smoke on a device: density, contiguous float or half [X, Y, Z], and extinction per voxel at density 1;
+    temperature in an array like it, None for smoke without light, and light emitted per voxel at temperature 1.
 
     `empty` allocates buffers on the density's device; None: Warp's own allocator. `bricks` tells which bricks of 8^3
     voxels contain smoke, a result of `occupied`; None: marches sample every voxel. With `places`, int [X / 8, Y / 8,
-    Z / 8], the numbers of bricks in `density` and `temperature`, these are [8 N, 8, 8], with 0 in brick 0, and `bricks`
-    must be given; None: all voxels are stored. `cells` are X, Y and Z; None: the density's. `solid` are obstacles in
+    Z / 8], the numbers of bricks in `density` and `temperature`, these are [8 N, 8, 8], with 0 in brick 0; None: all
+    voxels are stored. `cells` are X, Y and Z; None: the density's. `solid` are obstacles in
     the way of light and camera; None: there are none.
     """
 
@@ -289,70 +290,141 @@ def box_of(smoke: Any) -> wp.vec3:
     return wp.vec3(float(smoke.cells[0]), float(smoke.cells[1]), float(smoke.cells[2]))
 
 
-@wp.func
-def _voxel(field: wp.array3d[Any], places: int, i: int, j: int, k: int) -> float:
-    return float(field[i, j, k])
+# Addresses from Warp's 64-bit strides would take a GPU twice as long.
+@wp.func_native("return (float)field.data[i];")
+def _element(field: wp.array3d[wp.float32], i: int) -> float: ...
+
+
+@wp.func_native("return (float)field.data[i];")
+def _element(field: wp.array3d[wp.float16], i: int) -> float: ...
+
+
+_IN_BRICK = "return bricks.data[(i * bricks.shape[1] + j) * bricks.shape[2] + k];"
+
+
+@wp.func_native(_IN_BRICK)
+def _of_brick(bricks: wp.array3d[wp.uint8], i: int, j: int, k: int) -> int: ...
+
+
+@wp.func_native(_IN_BRICK)
+def _of_brick(bricks: wp.array3d[int], i: int, j: int, k: int) -> int: ...
 
 
 @wp.func
-def _voxel(field: wp.array3d[Any], places: wp.array3d[int], i: int, j: int, k: int) -> float:
-    return float(field[BRICK * places[i // BRICK, j // BRICK, k // BRICK] + i % BRICK, j % BRICK, k % BRICK])
+def _of_brick(bricks: int, i: int, j: int, k: int) -> int:
+    return 1
+
+
+@wp.func
+def _place(places: int, cells: wp.vec3i, i: int, j: int, k: int) -> int:
+    return (i * cells[1] + j) * cells[2] + k
+
+
+@wp.func
+def _place(places: wp.array3d[int], cells: wp.vec3i, i: int, j: int, k: int) -> int:
+    return (_of_brick(places, i >> 3, j >> 3, k >> 3) << 9) + ((i & 7) << 6) + ((j & 7) << 3) + (k & 7)
+
+
+@wp.func
+def voxel(field: wp.array3d[Any], smoke: Any, i: int, j: int, k: int) -> float:
+    """Returns the density or the temperature of a voxel."""
+    return _element(field, _place(smoke.places, smoke.cells, i, j, k))
+
+
+@wp.struct
+class Corners:
+    """The eight voxels around a point, z fastest, and their weights along the axes: `low` of the first ones, `high` of
+    the others."""
+
+    values: _Eight
+    low: wp.vec3
+    high: wp.vec3
+
+
+@wp.func
+def _around(field: wp.array3d[Any], smoke: Any, p: wp.vec3) -> Corners:
+    c = Corners()
+    low = wp.vec3i()
+    high = wp.vec3i()
+    for a in range(3):
+        x = p[a] - 0.5
+        n = int(wp.floor(x))
+        # Voxels outside the grid have weight 0 and a clamped index.
+        last = smoke.cells[a] - 1
+        c.low[a] = wp.where(n >= 0 and n <= last, 1.0 - (x - float(n)), 0.0)
+        c.high[a] = wp.where(n >= -1 and n < last, x - float(n), 0.0)
+        low[a] = wp.clamp(n, 0, last)
+        high[a] = wp.clamp(n + 1, 0, last)
+    for n in range(8):
+        i = wp.where(n < 4, low[0], high[0])
+        j = wp.where(n // 2 % 2 == 0, low[1], high[1])
+        k = wp.where(n % 2 == 0, low[2], high[2])
+        c.values[n] = voxel(field, smoke, i, j, k)
+    return c
+
+
+@wp.func
+def _between(c: Corners) -> float:
+    v = c.values
+    a = c.low[1] * (c.low[2] * v[0] + c.high[2] * v[1]) + c.high[1] * (c.low[2] * v[2] + c.high[2] * v[3])
+    b = c.low[1] * (c.low[2] * v[4] + c.high[2] * v[5]) + c.high[1] * (c.low[2] * v[6] + c.high[2] * v[7])
+    return c.low[0] * a + c.high[0] * b
 
 
 @wp.func
 def density_at(field: wp.array3d[Any], smoke: Any, p: wp.vec3) -> float:
     """Interpolates the density or the temperature of smoke trilinearly, with 0 outside the grid."""
-    x = p[0] - 0.5
-    y = p[1] - 0.5
-    z = p[2] - 0.5
-    i = int(wp.floor(x))
-    j = int(wp.floor(y))
-    k = int(wp.floor(z))
-    fx = x - float(i)
-    fy = y - float(j)
-    fz = z - float(k)
-    # Voxels outside the grid have weight 0 and a clamped index.
-    nx = smoke.cells[0]
-    ny = smoke.cells[1]
-    nz = smoke.cells[2]
-    wx0 = wp.where(i >= 0 and i < nx, 1.0 - fx, 0.0)
-    wx1 = wp.where(i >= -1 and i < nx - 1, fx, 0.0)
-    wy0 = wp.where(j >= 0 and j < ny, 1.0 - fy, 0.0)
-    wy1 = wp.where(j >= -1 and j < ny - 1, fy, 0.0)
-    wz0 = wp.where(k >= 0 and k < nz, 1.0 - fz, 0.0)
-    wz1 = wp.where(k >= -1 and k < nz - 1, fz, 0.0)
-    i0 = wp.clamp(i, 0, nx - 1)
-    i1 = wp.clamp(i + 1, 0, nx - 1)
-    j0 = wp.clamp(j, 0, ny - 1)
-    j1 = wp.clamp(j + 1, 0, ny - 1)
-    k0 = wp.clamp(k, 0, nz - 1)
-    k1 = wp.clamp(k + 1, 0, nz - 1)
-    a = wy0 * (wz0 * _voxel(field, smoke.places, i0, j0, k0) + wz1 * _voxel(field, smoke.places, i0, j0, k1))
-    a += wy1 * (wz0 * _voxel(field, smoke.places, i0, j1, k0) + wz1 * _voxel(field, smoke.places, i0, j1, k1))
-    b = wy0 * (wz0 * _voxel(field, smoke.places, i1, j0, k0) + wz1 * _voxel(field, smoke.places, i1, j0, k1))
-    b += wy1 * (wz0 * _voxel(field, smoke.places, i1, j1, k0) + wz1 * _voxel(field, smoke.places, i1, j1, k1))
-    return wx0 * a + wx1 * b
+    return _between(_around(field, smoke, p))
 
 
 @wp.func
-def _has_smoke(bricks: wp.array3d[wp.uint8], p: wp.vec3) -> bool:
-    i = wp.clamp(int(p[0]) // BRICK, 0, bricks.shape[0] - 1)
-    j = wp.clamp(int(p[1]) // BRICK, 0, bricks.shape[1] - 1)
-    k = wp.clamp(int(p[2]) // BRICK, 0, bricks.shape[2] - 1)
-    return bricks[i, j, k] != wp.uint8(0)
-
-
-@wp.func
-def _has_smoke(bricks: int, p: wp.vec3) -> bool:
-    return True
+def has_smoke(smoke: Any, p: wp.vec3) -> bool:
+    """Tells whether there may be smoke at p, at most half a voxel outside the grid."""
+    i = wp.clamp(int(p[0]), 0, smoke.cells[0] - 1)
+    j = wp.clamp(int(p[1]), 0, smoke.cells[1] - 1)
+    k = wp.clamp(int(p[2]), 0, smoke.cells[2] - 1)
+    return _of_brick(smoke.bricks, i >> 3, j >> 3, k >> 3) != 0
 
 
 @wp.func
 def sample(smoke: Any, p: wp.vec3) -> float:
     """Interpolates density at p, at most half a voxel outside the grid; returns 0 at once in a brick known as empty."""
-    if _has_smoke(smoke.bricks, p):
+    if has_smoke(smoke, p):
         return density_at(smoke.density, smoke, p)
     return 0.0
+
+
+@wp.func_native("""
+    const size_t n = (i * nodes.shape[1] + j) * nodes.shape[2] + k;
+#if defined(__CUDA_ARCH__)
+    const float2 value = reinterpret_cast<const float2*>(nodes.data)[n];
+    return wp::vec2f(value.x, value.y);
+#else
+    return nodes.data[n];
+#endif
+""")
+def _node(nodes: wp.array3d[wp.vec2], i: int, j: int, k: int) -> wp.vec2: ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    reinterpret_cast<float2*>(nodes.data)[n] = make_float2(value[0], value[1]);
+#else
+    nodes.data[n] = value;
+#endif
+""")
+def store_node(nodes: wp.array4d[wp.vec2], n: int, value: wp.vec2): ...
+
+
+@wp.func
+def _node(nodes: wp.array3d[Any], i: int, j: int, k: int):
+    return nodes[i, j, k]
+
+
+@wp.func
+def node(nodes: wp.array3d[Any], i: int, j: int, k: int):
+    """Returns an element of an array, which must be contiguous for pairs; a GPU loads these at once."""
+    return _node(nodes, i, j, k)
 
 
 @wp.func
@@ -369,9 +441,11 @@ def between_nodes(nodes: wp.array3d[Any], q: wp.vec3):
     k1 = wp.min(k + 1, nodes.shape[2] - 1)
     fy = y - float(j)
     fz = z - float(k)
-    near = wp.lerp(wp.lerp(nodes[i, j, k], nodes[i, j, k1], fz), wp.lerp(nodes[i, j1, k], nodes[i, j1, k1], fz), fy)
-    far = wp.lerp(wp.lerp(nodes[i1, j, k], nodes[i1, j, k1], fz), wp.lerp(nodes[i1, j1, k], nodes[i1, j1, k1], fz), fy)
-    return wp.lerp(near, far, x - float(i))
+    a = wp.lerp(node(nodes, i, j, k), node(nodes, i, j, k1), fz)
+    b = wp.lerp(node(nodes, i, j1, k), node(nodes, i, j1, k1), fz)
+    c = wp.lerp(node(nodes, i1, j, k), node(nodes, i1, j, k1), fz)
+    d = wp.lerp(node(nodes, i1, j1, k), node(nodes, i1, j1, k1), fz)
+    return wp.lerp(wp.lerp(a, b, fy), wp.lerp(c, d, fy), x - float(i))
 
 
 @wp.func
@@ -429,14 +503,30 @@ def begin_jittered(view: View, row: int, column: int, smoke: Any, march: MarchPa
 
 
 @wp.func
+def _two_may_have_smoke(r: Ray, smoke: Any) -> bool:
+    this = has_smoke(smoke, point_on(r, r.done, r.offset))
+    next = has_smoke(smoke, point_on(r, r.done + 1, r.offset))
+    return this or next
+
+
+@wp.func
 def look(r: Ray, smoke: Any) -> Ray:
-    """Samples the smoke in the ray's current step: sets the step's `distance`, `place`, `sigma` and `x`. Steps follow
-    one another from step 0."""
-    r.distance = r.first + (float(r.done) + r.offset) * r.length
-    r.place = r.origin + r.distance * r.direction
+    """Samples the smoke in the ray's current step, or passes cold steps in empty bricks to a later one: sets the step's
+    `distance`, `place`, `sigma` and `x`. Steps follow one another from step 0."""
     if r.done % 2 == 0:
         # Two samples at once, since a GPU's threads wait for them. One beyond the ray's end is not used.
-        r.pair = wp.vec2(sample(smoke, r.place), sample(smoke, point_on(r, r.done + 1, r.offset)))
+        some = _two_may_have_smoke(r, smoke)
+        while not some and smoke.emission == 0.0 and r.done + 2 < r.count:
+            r.done += 2
+            some = _two_may_have_smoke(r, smoke)
+        r.pair = wp.vec2()
+        if some:
+            # All voxels are loaded before the first is used.
+            one = _around(smoke.density, smoke, point_on(r, r.done, r.offset))
+            two = _around(smoke.density, smoke, point_on(r, r.done + 1, r.offset))
+            r.pair = wp.vec2(_between(one), _between(two))
+    r.distance = r.first + (float(r.done) + r.offset) * r.length
+    r.place = r.origin + r.distance * r.direction
     r.sigma = smoke.extinction * wp.where(r.done % 2 == 0, r.pair[0], r.pair[1])
     r.x = r.sigma * r.length
     return r
@@ -502,41 +592,74 @@ def nodes_along(shape: Sequence[int], step: float) -> tuple[int, ...]:
     return tuple(math.ceil((n + 1) / max(step, 1.0)) + 1 for n in shape)
 
 
-@functools.cache
-def occupied_kernel(dtype: Any) -> wp.Kernel:
-    """Builds (once) the kernel that says which runs of 8 voxels along z, and a voxel on either side, hold any smoke."""
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    for (int step = 16; step > 0; step /= 2)
+        bits |= __shfl_xor_sync(0xffffffffu, bits, step);
+#endif
+    return bits;
+""")
+def _of_any_lane(bits: int) -> int:
+    """Returns the bits that any thread of a warp has; on a CPU the bits themselves."""
+    ...
 
+
+@wp.func
+def _marks_of(some: bool, first: bool, last: bool, shift: int) -> int:
+    """Returns marks along an axis: whether there is some voxel, one of the first and one of the last of a brick."""
+    return int(some) | int(first) << shift | int(last) << 2 * shift
+
+
+@for_smoke
+def _mark(smoke_type: Any, lanes: int) -> wp.Kernel:
     @wp.kernel(module="unique", module_options=OPTIONS)
-    def rows(
+    def kernel(
         # in:
-        density: wp.array3d[dtype],
+        smoke: smoke_type,
         # out:
-        out: wp.array3d[wp.uint8],
+        marks: wp.array3d[int],
     ):
-        i, j, c = wp.tid()
-        smoke = wp.uint8(0)
-        for k in range(wp.max(c * BRICK - 1, 0), wp.min((c + 1) * BRICK + 1, density.shape[2])):
-            if float(density[i, j, k]) > 0.0:
-                smoke = wp.uint8(1)
-        out[i, j, c] = smoke
+        """Marks where in a brick there is smoke: bit 9 x + 3 y + z says whether in any voxel (x, y and z 0), in one of
+        the first ones along an axis (1) or of the last ones (2). A warp has a brick, a thread two columns along x."""
+        a, b, c, lane = wp.tid()
+        bits = int(0)
+        if _of_brick(smoke.places, a, b, c) != 0:
+            for n in range(lane, BRICK * BRICK, wp.static(lanes)):
+                # Beyond the grid its last voxel is read again, which belongs to the same brick.
+                j = wp.min(BRICK * b + (n >> 3), smoke.cells[1] - 1)
+                k = wp.min(BRICK * c + (n & 7), smoke.cells[2] - 1)
+                column = _Eight()
+                for x in range(BRICK):
+                    column[x] = voxel(smoke.density, smoke, wp.min(BRICK * a + x, smoke.cells[0] - 1), j, k)
+                along = _marks_of(wp.max(column) > 0.0, column[0] > 0.0, column[BRICK - 1] > 0.0, 9)
+                y = _marks_of(True, n < 8, n >= BRICK * BRICK - BRICK, 3)
+                bits = bits | along * y * _marks_of(True, (n & 7) == 0, (n & 7) == BRICK - 1, 1)
+        bits = _of_any_lane(bits)
+        if lane == 0:
+            marks[a, b, c] = bits
 
-    return rows
+    return kernel
 
 
 @wp.kernel(module="unique", module_options=OPTIONS)
-def _bricks_of_rows(
+def _join(
     # in:
-    rows: wp.array3d[wp.uint8],
+    marks: wp.array3d[int],
     # out:
     bricks: wp.array3d[wp.uint8],
 ):
     a, b, c = wp.tid()
-    smoke = wp.uint8(0)
-    # A sample in a brick reads up to half a voxel beyond the brick.
-    for i in range(wp.max(a * BRICK - 1, 0), wp.min((a + 1) * BRICK + 1, rows.shape[0])):
-        for j in range(wp.max(b * BRICK - 1, 0), wp.min((b + 1) * BRICK + 1, rows.shape[1])):
-            smoke = wp.max(smoke, rows[i, j, c])
-    bricks[a, b, c] = smoke
+    bits = int(0)
+    # A sample in a brick reads up to half a voxel beyond the brick: of a brick behind it the first voxels.
+    for x in range(3):
+        for y in range(3):
+            for z in range(3):
+                i = a + (x + 1) % 3 - 1
+                j = b + (y + 1) % 3 - 1
+                k = c + (z + 1) % 3 - 1
+                if wp.min(i, wp.min(j, k)) >= 0 and i < marks.shape[0] and j < marks.shape[1] and k < marks.shape[2]:
+                    bits = bits | marks[i, j, k] >> (9 * x + 3 * y + z)
+    bricks[a, b, c] = wp.uint8(bits & 1)
 
 
 def occupied(medium: Medium) -> wp.array:
@@ -545,12 +668,10 @@ def occupied(medium: Medium) -> wp.array:
     Returns:
         uint8 [X / 8, Y / 8, Z / 8], rounded up: 1 where the brick, or a voxel next to it, has smoke; else 0.
     """
-    density = medium.density
-    shape = tuple(-(-n // BRICK) for n in density.shape)
-    # Rows are reduced first, so that neighbouring threads read neighbouring voxels, and each voxel once.
-    rows, bricks = medium.buffer((*density.shape[:2], shape[2]), wp.uint8), medium.buffer(shape, wp.uint8)
-    wp.launch(occupied_kernel(density.dtype), rows.shape, [density], [rows], device=density.device)
-    wp.launch(_bricks_of_rows, shape, [rows], [bricks], device=density.device)
+    shape, lanes = tuple(-(-n // BRICK) for n in medium.shape), 32 if medium.device.is_cuda else 1
+    marks, bricks = medium.buffer(shape, int), medium.buffer(shape, wp.uint8)
+    _mark(medium, (*shape, lanes), [], [marks], lanes)
+    wp.launch(_join, shape, [marks], [bricks], device=medium.device)
     return bricks
 
 

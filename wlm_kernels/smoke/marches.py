@@ -27,6 +27,7 @@ from wlm_kernels.smoke.march import (
     for_smoke,
     in_tiles,
     look,
+    node,
     optical_depth,
     parameters,
     pass_step,
@@ -134,8 +135,8 @@ def guide(medium: Medium, view: View, march: March, out: wp.array, *, shared: bo
 def _in_plane(nodes: wp.array4d[wp.vec2], i: int, j: int, k: int, fx: float, fy: float) -> wp.vec4:
     sides = wp.vec4()
     for pair in range(2):
-        a = wp.lerp(nodes[pair, i, j, k], nodes[pair, i, j + 1, k], fy)
-        b = wp.lerp(nodes[pair, i + 1, j, k], nodes[pair, i + 1, j + 1, k], fy)
+        a = wp.lerp(node(nodes[pair], i, j, k), node(nodes[pair], i, j + 1, k), fy)
+        b = wp.lerp(node(nodes[pair], i + 1, j, k), node(nodes[pair], i + 1, j + 1, k), fy)
         c = wp.lerp(a, b, fx)
         sides[2 * pair] = c[0]
         sides[2 * pair + 1] = c[1]

@@ -1,9 +1,11 @@
 """Launches ray march kernels on a volume of smoke, with results as torch tensors."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import torch
+import warp as wp
 
 from wlm.fluid.volume import DensityVolume
 from wlm.interop import device_name, stream, to_warp, torch_memory
@@ -36,8 +38,16 @@ def medium_of(volume: DensityVolume) -> Medium:
     density, temperature = volume.arrays()
     factors = (volume.extinction * volume.voxel, temperature, volume.emission * volume.voxel)
     more: dict[str, Any] = {"solid": volume.solid}
+    if volume.near is not None:
+        more["bricks"] = to_warp(volume.near)
     if volume.places is not None:
-        # A sample reads up to half a voxel beyond its brick.
-        near = torch.nn.functional.max_pool3d((volume.places > 0).float()[None, None], 3, 1, 1)[0, 0]
-        more |= {"bricks": to_warp(near.byte()), "places": to_warp(volume.places), "cells": volume.shape}
+        more |= {"places": to_warp(volume.places), "cells": volume.shape}
     return Medium(density, *factors, empty=torch_memory(volume.device), **more)
+
+
+def in_bricks(volume: DensityVolume) -> DensityVolume:
+    """Returns the volume with its bricks that have smoke, for several marches while the smoke stays the same."""
+    if volume.near is not None:
+        return volume
+    with stream(device_name(volume.device)):
+        return replace(volume, near=wp.to_torch(medium_of(volume).in_bricks().bricks))

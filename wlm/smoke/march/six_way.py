@@ -17,7 +17,7 @@ from wlm.fluid.volume import DensityVolume
 from wlm.interop import device_name, stream
 from wlm.smoke.camera import DIRECTIONS, Camera
 from wlm.smoke.lightmaps import SixWay, StepError
-from wlm.smoke.march.launch import run
+from wlm.smoke.march.launch import in_bricks, run
 from wlm.smoke.scene import Looks
 from wlm_kernels.smoke import march_six, marches
 from wlm_kernels.smoke.settings import March
@@ -56,6 +56,7 @@ def bake(
     """
     if supersample < 1:
         raise ValueError(f"supersample: expected at least 1 ray along a pixel's edge, got {supersample}")
+    volume = in_bricks(volume)
     with stream(device_name(volume.device)):
         fine = _planes(volume, camera, March(step=step, g=g), supersample)
         error = None

@@ -7,6 +7,7 @@ are computed at the resolution of the smoke.
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -80,7 +81,7 @@ def thrown_by_fire(scene: Marching, volume: DensityVolume, albedos: Sequence[flo
     """Computes the light that hot smoke emits and scatters to the camera of a march, [A, H, W] for one to three
     albedos."""
     coarse = CoarseSmoke(volume)
-    source = coarse.mean(volume.temperature).mul_(4.0 * math.pi * volume.emission * volume.voxel)
+    source = coarse.mean(hot=True).mul_(4.0 * math.pi * volume.emission * volume.voxel)
     # Emitted light has not been scattered yet: `spread` multiplies it by the albedo.
     return coarse.render(scene, coarse.spread(source[None], albedos))[0][0]
 
@@ -91,18 +92,19 @@ class CoarseSmoke:
 
     def __init__(self, volume: DensityVolume, cells: int = CELLS) -> None:
         """Averages the smoke over `cells` cells along its longest edge; to be called inside `wlm.interop.stream`."""
-        self.medium, self._volume = medium_of(volume), volume
+        self.medium, self._device = medium_of(volume), volume.device
         longest = max(volume.shape)
         self._counts = [max(1, round(cells * n / longest)) for n in volume.shape]
         self.edges = tuple(n / count for n, count in zip(volume.shape, self._counts, strict=True))
-        self.extinction = self.mean(volume.density).mul_(volume.extinction * volume.voxel)
+        self.extinction = self.mean().mul_(volume.extinction * volume.voxel)
 
-    def mean(self, voxels: torch.Tensor) -> torch.Tensor:
-        """Returns the mean of the volume's density or temperature over each coarse cell, float32 [X, Y, Z]."""
-        parts = zip(self._volume.shape, self._counts, strict=True)
-        x, y, z = (_shares(*part, voxels.device) for part in parts)
-        planes = [torch.tensordot(slab.float() @ z, y, ([1], [0])) for slab in self._volume.slabs(voxels)]
-        return torch.tensordot(torch.cat(planes), x, ([0], [0])).permute(2, 1, 0).contiguous()
+    def mean(self, hot: bool = False) -> torch.Tensor:
+        """Returns the mean of the volume's density, or of its temperature, over each coarse cell, float32 [X, Y, Z]."""
+        # Bricks that are known as empty have no smoke, but may be hot.
+        medium = replace(self.medium, bricks=None) if hot else self.medium
+        out = torch.empty(self._counts, device=self._device)
+        diffusion.mean(medium, medium.temperature if hot else medium.density, wp.vec3(*self.edges), to_warp(out))
+        return out
 
     def spread(self, source: torch.Tensor, albedos: Sequence[float]) -> torch.Tensor:
         """Computes the fluence, the light from all directions, of light that was scattered at least once, by diffusion.
@@ -146,11 +148,3 @@ class CoarseSmoke:
         power = 16.0 * math.pi**2 / math.prod(self.edges)
         cell = wp.vec3(*self.edges)
         diffusion.shoot(scene.medium, wp.vec3(*place), radius, step, cell, power, to_warp(out))
-
-
-def _shares(voxels: int, cells: int, device: torch.device) -> torch.Tensor:
-    """Returns the weight of each voxel in the mean of each cell along one axis, [voxels, cells]."""
-    low = torch.arange(voxels, device=device)[:, None]
-    first = torch.arange(cells, device=device) * (voxels / cells)
-    over = torch.minimum(low + 1.0, first + voxels / cells) - torch.maximum(low.float(), first)
-    return over.clamp(min=0.0) * (cells / voxels)

@@ -23,6 +23,7 @@ from wlm.fluid.volume import DensityVolume
 from wlm.formats.npz import read_npz
 from wlm.interop import device_name, stream, to_warp
 from wlm.smoke.camera import Camera, unit
+from wlm.smoke.march.launch import in_bricks
 from wlm.smoke.shading import AnyLight, Light, PointLight, Ramp, checked_albedo
 from wlm.smoke.transport.diffusion import Spreading, share_of, thrown_by_fire
 from wlm.smoke.transport.lighting import LitSmoke, light_in, light_smoke, marching
@@ -265,6 +266,7 @@ def scatter(
     colour = checked_albedo(albedo)
     march = orders_march(volume) if march is None else march
     model = (_shipped() if model is None else model).to(volume.device)
+    volume = in_bricks(volume)
     with stream(device_name(volume.device)):
         alike, thinner, even = volume, colour, march
         if march.g != 0.0:
