@@ -17,7 +17,7 @@ from benchmarks import matrix_tiles, smoke_path
 from wlm_kernels import mlp
 from wlm_kernels.fluid import advection, advection_sources, fire, lattice, lattice_bodies, lattice_fields, lattice_links
 from wlm_kernels.lightmap import decode as lightmap_decode
-from wlm_kernels.lightmap import matrix_pages, pages
+from wlm_kernels.lightmap import gather, matrix_pages, pages
 from wlm_kernels.lightmap import step as lightmap_step
 from wlm_kernels.probe import decode as probe_decode
 from wlm_kernels.probe import gaussian_sum
@@ -118,6 +118,7 @@ def _cases(name: str, build: Callable, quick: list[tuple], *axes: tuple) -> Iter
 FACTORIES = [
     *_cases("mlp", lambda *of: mlp.kernels(16, *of), [], WIDTHS, ("fast", "exact", "tanh"), (3, 5)),
     *_cases("step", lambda *of: lightmap_step.step_kernels(*of, "cuda"), [], (16, 64), ("tanh", "exact")),
+    *_cases("muon", lambda width: [gather._turn_kernel(width, width * width // 8)], [(64,)], (16, 32, 48, 64)),
     *_cases("exact_decode", lambda width: [lightmap_decode.exact_kernel(width, "tanh")], [], WIDTHS),
     *_cases("matrix_tiles", matrix_tiles.matrix_kernels, [], (16, 48, 64), (4, 32, 128)),
     *_cases("pages", lambda *of: [pages.page_kernel(*of)], [], (8, 16, 64), ("fast", "exact")),
