@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 import warp as wp
-from builders.checks import error_of
+from builders.checks import error_of, misuse_of
 from builders.probe_models import EXTENT, ORIGIN, SIZE, random_model
 
 from benchmarks import probe_exact as exact
@@ -118,8 +118,7 @@ def test_wrong_positions():
     bad = np.zeros((4, 3))
     bad[2, 1] = np.nan
     assert "position 2: expected finite" in error_of(decoder.decode, bad)
-    with pytest.raises(ValueError, match=r"expected \[M, 3\]"):
-        decoder.decode(np.zeros(3))
+    assert "expected [M, 3]" in misuse_of(decoder.decode, np.zeros(3))
     assert "device 'cuda:9'" in error_of(GaussianDecoder, random_model(), "cuda:9")
     assert decoder.decode(np.zeros((0, 3))).shape == (0, 27)
 
