@@ -247,11 +247,8 @@ def test_a_sample_of_many_tiles_says_whether_apart_comes_near(unlike, monkeypatc
 def files(folder, states=("day", "night")):
     position, triangle, uv = box((0, 0, 0), (2, 2, 2))
     half = uv * [0.5, 1.0]
-    things = [
-        Thing("left", position, triangle, [uv, uv]),
-        Thing("right", like=0, translation=(4, 0, 0)),
-        Thing("rock", position + [0, 0, 4], triangle, [uv]),
-    ]
+    things = [Thing("left", position, triangle, [uv, uv]), Thing("right", like=0, translation=(4, 0, 0))]
+    things += [Thing("rock", position + [0, 0, 4], triangle, [uv])]
     path = write_scene(folder / "scene.gltf", things)
     for i, state in enumerate(states):
         write_exr(folder / f"{state}.exr", lights(i)[0])

@@ -55,19 +55,10 @@ def test_cases():
 
 def test_a_profile():
     """Launches of one kernel are summed, weighted by time; the busiest unit and what warps wait for are named."""
+    step = "void wp::kernels__locals__step_1f_cuda_kernel_forward<4>(int)"
     launches = [
-        _launch(
-            "void wp::kernels__locals__step_1f_cuda_kernel_forward<4>(int)",
-            3000,
-            90.0,
-            {"long_scoreboard": 5.0, "wait": 1.0},
-        ),
-        _launch(
-            "void wp::kernels__locals__step_1f_cuda_kernel_forward<4>(int)",
-            1000,
-            50.0,
-            {"long_scoreboard": 5.0, "wait": 1.0},
-        ),
+        _launch(step, 3000, 90.0, {"long_scoreboard": 5.0, "wait": 1.0}),
+        _launch(step, 1000, 50.0, {"long_scoreboard": 5.0, "wait": 1.0}),
         _launch("copy", 1000, 20.0, {"barrier": 2.0, "drain": 3.0}),
     ]
     first, second = summarise(Bench("kernels-profile", "cpu", None).row, CASE, launches)

@@ -342,11 +342,8 @@ def _ring(inner: float, outer: float, centre, sides: int = 96) -> Mesh:
     angle = np.arange(sides) * (2 * np.pi / sides)
     section = ((inner, -1), (outer, -1), (outer, 1), (inner, 1))
     corners = [(r * np.cos(a), r * np.sin(a), z) for a in angle for r, z in section]
-    quads = [
-        (4 * k + a, 4 * ((k + 1) % sides) + a, 4 * ((k + 1) % sides) + b, 4 * k + b)
-        for k in range(sides)
-        for a, b in ((0, 1), (1, 2), (2, 3), (3, 0))
-    ]
+    sides_of = ((k, (k + 1) % sides, a, (a + 1) % 4) for k in range(sides) for a in range(4))
+    quads = [(4 * k + a, 4 * after + a, 4 * after + b, 4 * k + b) for k, after, a, b in sides_of]
     triangles = [t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))]
     return Mesh(Trajectory.of(centre), np.array(corners, np.float32), np.array(triangles))
 

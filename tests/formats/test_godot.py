@@ -74,11 +74,8 @@ def test_who_reads_which_part_of_the_lightmap(tmp_path, order, double):
 def test_one_probe_and_keys_that_are_string_names_or_no_text(tmp_path):
     writer = Writer()
     points, sh = probes(1)
-    entries = [
-        writer.u32(3, 1) + writer.u32(1),
-        writer.string("sh", 44) + writer.colours(colours(sh)),
-        writer.string("points", 44) + writer.vectors(points),
-    ]
+    entries = [writer.u32(3, 1) + writer.u32(1), writer.string("sh", 44) + writer.colours(colours(sh))]
+    entries.append(writer.string("points", 44) + writer.vectors(points))
     data = writer.u32(26, len(entries)) + b"".join(entries)
     (tmp_path / "a.lmbake").write_bytes(writer.file([("probe_data", data)]))
     position, found = read_lmbake(tmp_path / "a.lmbake")

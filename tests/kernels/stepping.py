@@ -192,15 +192,8 @@ class Problem:
     def features(self) -> torch.Tensor:
         """The network's inputs, centred and with the noise, [N, B, 16]."""
         flat = self.place.reshape(-1, 3)
-        features = reference.train_features(
-            self.maps,
-            self.tile,
-            flat[:, :2],
-            self.tau.flatten(),
-            self.encoding.reshape(-1, 4),
-            self.periodic,
-            self.quantised,
-        )
+        coded = (self.tau.flatten(), self.encoding.reshape(-1, 4), self.periodic, self.quantised)
+        features = reference.train_features(self.maps, self.tile, flat[:, :2], *coded)
         return reference.centre(features).reshape(self.noise.shape) + self.noise
 
     def losses(self) -> torch.Tensor:

@@ -174,15 +174,8 @@ def ssim_of(ref, test, mask=None):
 
 def test_ssim_of_a_full_mask_is_scikit_images():
     ref, test = (image.astype(np.float64) for image in make_pair())
-    expected = structural_similarity(
-        ref,
-        test,
-        data_range=float(np.ptp(ref)),
-        channel_axis=2,
-        gaussian_weights=True,
-        sigma=1.5,
-        use_sample_covariance=False,
-    )
+    options = {"channel_axis": 2, "gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
+    expected = structural_similarity(ref, test, data_range=float(np.ptp(ref)), **options)
     assert 0.5 < expected < 0.999
     assert ssim_of(ref, test) == pytest.approx(expected, abs=1e-12)
 

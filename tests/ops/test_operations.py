@@ -287,14 +287,8 @@ def test_phase_function(device: str, g: float):
     """Light from behind, from the side and from the front, in smoke so thin that all of it gets through."""
     density = torch.full((8, 8, 8), 1e-5, device=device)
     toward = torch.stack([AHEAD, AHEAD.roll(1), -AHEAD]).to(device)
-    light = torch.cat(
-        [
-            ops.march(density, **_middle_rays(device, 1), toward=t[None], colour=torch.ones(1, 3, device=device), g=g)[
-                0
-            ][:, 0]
-            for t in toward
-        ]
-    )
+    lit = ({"toward": t[None], "colour": torch.ones(1, 3, device=device)} for t in toward)
+    light = torch.cat([ops.march(density, **_middle_rays(device, 1), **each, g=g)[0][:, 0] for each in lit])
     cosine = torch.tensor([1.0, 0.0, -1.0], dtype=torch.float64)
     want = 8e-5 * (1.0 - g * g) / (1.0 + g * g - 2.0 * g * cosine) ** 1.5
     close(light, want, 1e-3)
