@@ -303,10 +303,8 @@ def test_materials_own_lightmaps(tmp_path):
         return {"extensions": {"MOZ_lightmap": {"index": 0, "texCoord": 0, "intensity": 2.0} | more}}
 
     shift = {"extensions": {"KHR_texture_transform": {"scale": [0.5, 0.5], "offset": [0.5, 0.5]}}}
-    things = [
-        Thing("a", position, triangle, [uv * 0.5], material=material()),
-        Thing("b", position + 3, triangle, [uv], material=material(**shift)),
-    ]
+    meshes = ("a", position, triangle, [uv * 0.5]), ("b", position + 3, triangle, [uv])
+    things = [Thing(*meshes[0], material=material()), Thing(*meshes[1], material=material(**shift))]
     images = {"textures": [{"source": 0}], "images": [{"uri": "day.exr", "name": "baked"}]}
     path = write_scene(tmp_path / "scene.gltf", things, images)
     write_exr(tmp_path / "day.exr", lights(0)[0])

@@ -50,11 +50,8 @@ def small_layers(height=128, width=128, hours=HOURS, period=24.0) -> LightmapSet
     light, directions = moving_light(height, width, hours).light.frames, turning_directions(height, width, hours)
     mask = np.zeros((len(hours), height, width, 3), np.float32)
     mask[..., 1] = mask[..., 2] = light[..., 0] / light.max()
-    layers = [
-        Layer(light, "light"),
-        Layer(directions, "dir", encoding="signed"),
-        Layer(mask, "shadow", encoding="unit"),
-    ]
+    layers = [Layer(light, "light"), Layer(mask, "shadow", encoding="unit")]
+    layers.insert(1, Layer(directions, "dir", encoding="signed"))
     return from_layers(layers, hours, period=period, name="layers")
 
 

@@ -184,9 +184,8 @@ def test_sets_are_joined_by_the_rules(sets):
 def test_groups_are_read_from_a_list_and_from_options(sets, tmp_path):
     path = write_groups(tmp_path / "lit", sets)
     read = load(path)
-    for (sheet, own), (other, expected) in zip(
-        read.sheets.items(), from_groups(sets, "lit").sheets.items(), strict=True
-    ):
+    whole = from_groups(sets, "lit").sheets.items()
+    for (sheet, own), (other, expected) in zip(read.sheets.items(), whole, strict=True):
         assert sheet == other
         np.testing.assert_array_equal(own.frames, expected.frames)
         assert own.times.tolist() == expected.times.tolist() and own.period == 24.0

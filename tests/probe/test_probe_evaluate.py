@@ -55,9 +55,8 @@ def test_the_scores_are_those_of_plain_sums(pair):
     assert report.max_abs_error == np.abs(error).max()
     lengths = [math.dist(row, [0.0] * 27) for row in probes.values.tolist()]
     typical = math.exp(sum(math.log(length) for length in lengths if length) / 48)
-    relative = [
-        math.dist(a, b) / math.hypot(c, 1e-4 * typical) for a, b, c in zip(decoded, probes.values, lengths, strict=True)
-    ]
+    rows = zip(decoded, probes.values, lengths, strict=True)
+    relative = [math.dist(a, b) / math.hypot(c, 1e-4 * typical) for a, b, c in rows]
     worst = int(np.argmax(relative))
     assert report.worst_probe == {
         "probe": worst,

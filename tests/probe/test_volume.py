@@ -207,9 +207,8 @@ def test_blocks_have_the_stated_light(device: str):
             room = 5e-4 * np.maximum(np.abs(low), np.abs(high)) + 1e-5
             assert (got > low - room).all() and (got < high + room).all()
     assert 0 < full < len(there) / 2
-    assert sum(s.probes for s in stats) == sum(
-        min(16, len(volume_blocks.near(position, tuple(block), volume.sizes[level]))) for level, *block in there
-    )
+    near = (len(volume_blocks.near(position, tuple(block), volume.sizes[level])) for level, *block in there)
+    assert sum(s.probes for s in stats) == sum(min(16, count) for count in near)
 
 
 def test_read_at_a_probe_is_that_probes_light(device: str):

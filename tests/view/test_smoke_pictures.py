@@ -1,4 +1,4 @@
-"""Pictures of smoke: what is drawn where, before and behind the smoke, and in which cell of a sheet."""
+"""Pictures of light and smoke: what is drawn where, before and behind the smoke, and in which cell of a sheet."""
 
 import math
 from dataclasses import replace
@@ -16,7 +16,8 @@ from wlm.smoke.scene import CameraSettings, LightSettings, ObstacleSettings, mak
 from wlm.smoke.shading import Light, PointLight, Ramp
 from wlm.smoke.transport.lighting import light_smoke
 from wlm.smoke.transport.orders import scatter
-from wlm.view.pictures import contact_sheet, to_bytes
+from wlm.view.display import white_of
+from wlm.view.pictures import contact_sheet, encode, to_bytes
 from wlm.view.smoke import Drawing, picture
 from wlm_kernels.smoke.settings import March
 
@@ -228,3 +229,16 @@ def test_lightmaps_are_lit_from_directions_alone():
     camera = _camera(8)
     half = picture(_flat(camera, 0.5, 0.4), [FRONT], albedo=(0.5, 1.0, 0.0))
     torch.testing.assert_close(half, picture(_flat(camera, 0.5, 0.4), [FRONT]) * torch.tensor([0.5, 1.0, 0.0]))
+
+
+def test_exposure():
+    light = np.array([[[0.0, 0.5, 1.0], [2.0, -1.0, 0.001]]])
+    encoded = encode(light, np.array([[True, True]]), 1.0)
+    # sRGB of a half is 188, of a thousandth 12.92 / 1000.
+    np.testing.assert_array_equal(encoded, [[[0, 188, 255], [255, 0, 3]]])
+    assert (encode(light, np.zeros((1, 2), bool), 1.0) == 128).all()
+    assert white_of(np.zeros((5, 3))) == 1.0 == white_of(np.zeros((0, 3)))
+    dark = np.zeros((10000, 3))
+    dark[0] = 3.0
+    assert white_of(dark) == 3.0, "one lamp in the dark"
+    assert white_of(np.arange(1001.0)) == pytest.approx(995.0)

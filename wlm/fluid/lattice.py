@@ -48,21 +48,11 @@ _STALE = 3
 class Setup:
     """The settings of a lattice of N cells, with copies of its L links, solids and force, for `wlm.fluid.gradients`.
 
-    Attributes:
-        shape: Cells along x, y and z.
-        spec: The settings for which the kernel of a step is specialised.
-        tables: The velocity set.
-        layout: The domain, and the layout of populations of parity 0.
-        tau, eddy: Relaxation time, and factor of the eddy viscosity.
-        ramp: Number of steps in which inlets rise to their velocity.
-        links: The links of faces and solids.
-        inlet: int [L], the cell of an inlet that decides a link, numbered in the order of `FACES`, or -1.
-        inlets: Number of cells of inlets.
-        outlets: Whether there are outlets.
-        link_kernels, fluid_kernels: Kernels for the lattice's velocity set.
-        solid: uint8 [N], number of the body of each cell; [0] without solids.
-        bodies: The motion of the bodies.
-        forces: vec3 [N], the force; [0] without.
+    `spec` are those for which the kernel of a step is specialised; `layout` has the layout of populations of parity 0;
+    `tau` is the relaxation time, `eddy` the factor of the eddy viscosity, `ramp` the number of steps in which inlets
+    rise to their velocity. `inlet`, int [L], is the cell of an inlet that decides a link, or -1, of `inlets` cells in
+    the order of `FACES`; `outlets` says whether there are outlets. `solid`, uint8 [N], is the number of the body of
+    each cell, [0] without solids; `bodies` their motion; `forces`, vec3 [N], the force, [0] without.
     """
 
     shape: tuple[int, int, int]
@@ -155,7 +145,8 @@ class Lattice:
         self._set, self._tables = velocity_set(lattice), tables(lattice, str(self.device))
         size = (len(self._set.c), self._cells)
         # The settings for which the kernel of a step is specialised.
-        self._spec = replace(spec, wide=math.prod(size) > NARROW)
+        group = 2 if storage == "float16" and self.shape[2] % 2 == 0 else 1
+        self._spec = replace(spec, wide=math.prod(size) > NARROW, group=group)
         self._arrays = [self._zeros(size, STORAGES[storage][0]) for _ in range(1 if save_memory else 2)]
         self._parity = 0  # of the clock and, in place, of the populations; else the array that has them
         # A ramp of one step is no ramp: inflow begins after it.
@@ -727,7 +718,7 @@ class Lattice:
             outputs = [self._clock, self._trouble, self._sums, self._spare]
             # Small blocks are faster with solids, large ones without (docs/notes/fluid-speed.md).
             block_dim = 128 if self._spec.solids else 256
-            self.slabs.launch(step_kernel(self._spec), inputs, outputs, block_dim)
+            self.slabs.launch(step_kernel(self._spec), inputs, outputs, block_dim, self._spec.group)
             self._parity = 1 - self._parity
             if self._growth is not None:
                 expand = expand_kernel(self._spec.lattice, self._spec.storage, self._spec.in_place)

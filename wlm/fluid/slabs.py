@@ -98,9 +98,9 @@ class Slabs:
         for device in self._others:
             self.home.stream.wait_stream(device.stream)
 
-    def launch(self, kernel: wp.Kernel, inputs: list, outputs: list, block_dim: int = 256) -> None:
-        """Launches a kernel with one thread per cell, as `launch_slab`."""
-        self.each(lambda slab: launch_slab(kernel, self._n, slab, inputs, outputs, block_dim))
+    def launch(self, kernel: wp.Kernel, inputs: list, outputs: list, block_dim: int = 256, group: int = 1) -> None:
+        """Launches a kernel for all cells, as `launch_slab`."""
+        self.each(lambda slab: launch_slab(kernel, self._n, slab, inputs, outputs, block_dim, group))
 
 
 class _Divided(wp.CudaManagedAllocator):

@@ -74,6 +74,7 @@ class Spec:
         walls: For each axis whether both of its faces are walls at rest.
         wide: Whether elements are indexed in 64 bits, see `lattice_sets.memory_functions`.
         in_place: Whether a step writes into the array that it reads.
+        group: Number of cells that a thread computes, see `lattice_sets.MemoryFunctions`.
     """
 
     lattice: str
@@ -84,6 +85,7 @@ class Spec:
     walls: tuple[bool, bool, bool] = (False, False, False)
     wide: bool = False
     in_place: bool = False
+    group: int = 1
 
     def __post_init__(self) -> None:
         lattice(self.lattice)
@@ -155,7 +157,8 @@ def _relax(spec: Spec) -> Any:
 
 @functools.cache
 def step_kernel(spec: Spec) -> wp.Kernel:
-    """Builds (once) the kernel that does a step with the settings of a spec, one thread per cell of a slab.
+    """Builds (once) the kernel that does a step with the settings of a spec, one thread per group of cells
+    of a slab.
 
     Args of the kernel, for N cells and Q velocities:
         first: Index of the slab's first cell.
@@ -171,10 +174,13 @@ def step_kernel(spec: Spec) -> wp.Kernel:
         sums: float64 [2 P], set to 0, for `lattice_links.apply`.
         out: [Q, N], the populations that leave every cell in this step: in place `f`, else another array.
     """
-    memory, relax = memory_functions(spec.lattice, spec.storage, spec.walls, spec.wide, spec.in_place), _relax(spec)
+    settings = spec.lattice, spec.storage, spec.walls, spec.wide, spec.in_place, spec.group
+    memory, relax, group, count = memory_functions(*settings), _relax(spec), spec.group, len(lattice(spec.lattice).c)
     gather, moments, scatter, stored = memory.gather, memory.moments, memory.scatter, STORAGES[spec.storage][0]
+    vec, cell_vec = memory.vec, wp.types.vector(count, float)
 
-    @wp.kernel(module="unique", module_options=_OPTIONS)
+    # A loop over blocks, which no launch here needs, would take a tenth of the instructions.
+    @wp.kernel(module="unique", module_options=_OPTIONS, grid_stride=False)
     def step(
         # in:
         first: int,
@@ -191,28 +197,42 @@ def step_kernel(spec: Spec) -> wp.Kernel:
         sums: wp.array1d[wp.float64],
         out: wp.array2d[stored],
     ):
-        i = first + wp.tid()
+        i = first + group * wp.tid()
         if i == 0:
             clock[1 - parity] = clock[parity] + 1
             for k in range(sums.shape[0]):
                 sums[k] = wp.float64(0.0)
+        # Populations of solid cells are read too: a test before it would wait for the memory.
+        arrived = gather(f, n, _ALL, i, parity)
+        covered = int(0)
         if wp.static(spec.solids):
-            if solid[i] != wp.uint8(0):
+            for m in range(wp.static(group)):
+                covered += int(solid[i + m] != wp.uint8(0)) << m
+            if covered == wp.static((1 << group) - 1):
                 return
-        drho, j, diagonal, off = moments(gather(f, n, _ALL, i, parity))
-        rho = 1.0 + drho
-        j2 = wp.dot(j, j)
-        if not (rho > 0.0 and j2 < _SOUND2 * rho * rho):
-            code = int(1)
-            if not (j2 >= 0.0):
-                code = 2
-            elif rho <= 0.0:
-                code = 0
-            key = wp.int64(clock[parity]) * _CELLS + wp.int64(i)
-            wp.atomic_min(trouble, 0, key * _CODES + wp.int64(code))
-        push = wp.vec3()
-        if wp.static(spec.forced):
-            push = forces[i]
-        scatter(out, n, _ALL, i, 1 - parity, relax(drho, j, diagonal, off, push, tau, eddy))
+        left = vec()  # 0 for solid cells, where nothing reads it
+        for m in range(wp.static(group)):
+            if (covered >> m) & 1 == 0:
+                g = cell_vec()
+                for q in range(wp.static(count)):
+                    g[q] = arrived[m * wp.static(count) + q]
+                drho, j, diagonal, off = moments(g)
+                rho = 1.0 + drho
+                j2 = wp.dot(j, j)
+                if not (rho > 0.0 and j2 < _SOUND2 * rho * rho):
+                    code = int(1)
+                    if not (j2 >= 0.0):
+                        code = 2
+                    elif rho <= 0.0:
+                        code = 0
+                    key = wp.int64(clock[parity]) * _CELLS + wp.int64(i + m)
+                    wp.atomic_min(trouble, 0, key * _CODES + wp.int64(code))
+                push = wp.vec3()
+                if wp.static(spec.forced):
+                    push = forces[i + m]
+                g = relax(drho, j, diagonal, off, push, tau, eddy)
+                for q in range(wp.static(count)):
+                    left[m * wp.static(count) + q] = g[q]
+        scatter(out, n, _ALL, i, 1 - parity, left)
 
     return step

@@ -142,11 +142,13 @@ def link_kernels(
         return equilibrium(t.w[q], t.c[q], drho, u)
 
     @wp.func
-    def summed(thread: int, sums: wp.array1d[wp.float64], at: int, value: wp.float64):
+    def summed(thread: int, sums: wp.array1d[wp.float64], at: int, values: wp.vec2d):
         # All threads of a block take part in its sums; most terms are 0.
-        total = wp.tile_extract(wp.tile_sum(wp.tile(value)), 0)
-        if thread % wp.block_dim() == 0 and total != wp.float64(0.0):
-            wp.atomic_add(sums, at, total)
+        total = wp.tile_extract(wp.tile_sum(wp.tile(values, preserve_type=True)), 0)
+        if thread % wp.block_dim() == 0:
+            for k in range(2):
+                if total[k] != wp.float64(0.0):
+                    wp.atomic_add(sums, at + k, total[k])
 
     @wp.kernel(module="unique", module_options=options)
     def values(
@@ -168,15 +170,16 @@ def link_kernels(
         link = first + wp.tid()
         net = wp.float64(0.0)
         weight = wp.float64(0.0)
-        live = link < wp.min(last, links.used[0])
-        if live:
+        if link < last:
             i = links.cell[link]
             q = int(links.code[link]) & 31
             kind = int(links.code[link]) >> 5
+            # Read before the tests, which would wait for the memory.
+            out = load(f, leaving(f, at, i, cell_of(at.n, i), opposite(q), -t.c[q]))
+            live = link < links.used[0]
             if solid.shape[0] > 0:
-                live = solid[i] == wp.uint8(0)
+                live = live and solid[i] == wp.uint8(0)
             if live:
-                out = load(f, leaving(f, at, i, cell_of(at.n, i), opposite(q), -t.c[q]))
                 v = float(0.0)
                 if kind == _BOUNCE:
                     v = out + links.term[link]
@@ -203,8 +206,7 @@ def link_kernels(
                 if kind == _OUTLET:
                     weight = wp.float64(t.w[q])
         if wp.static(balance):
-            summed(wp.tid(), sums, 2 * slab, net)
-            summed(wp.tid(), sums, 2 * slab + 1, weight)
+            summed(wp.tid(), sums, 2 * slab, wp.vec2d(net, weight))
 
     @wp.kernel(module="unique", module_options=options)
     def write(
@@ -334,7 +336,7 @@ def link_kernels(
                         store(f, wp.where(turned, here, there), load(f, left) + term)
                         net += wp.float64(term)
         if wp.static(balance):
-            summed(wp.tid(), sums, 0, net)
+            summed(wp.tid(), sums, 0, wp.vec2d(net, wp.float64(0.0)))
 
     return LinkKernels(values, write, force, bounce)
 

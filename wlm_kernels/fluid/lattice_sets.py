@@ -78,12 +78,14 @@ class Slab:
     number: int = 0
 
 
-def launch_slab(kernel: wp.Kernel, n: wp.vec3i, slab: Slab, inputs: list, outputs: list, block_dim: int = 256) -> None:
-    """Launches a kernel with one thread for each cell of a slab of n cells along x, y and z; the first input of the
-    kernel, here added, is the index of the slab's first cell."""
+def launch_slab(
+    kernel: wp.Kernel, n: wp.vec3i, slab: Slab, inputs: list, outputs: list, block_dim: int = 256, group: int = 1
+) -> None:
+    """Launches a kernel with one thread for each `group` cells of a slab of n cells along x, y and z; the first input,
+    here added, is the index of the slab's first cell."""
     plane = n[1] * n[2]
     inputs = [slab.begin * plane, *inputs]
-    threads = (slab.end - slab.begin) * plane
+    threads = (slab.end - slab.begin) * plane // group
     wp.launch(kernel, threads, inputs=inputs, outputs=outputs, device=slab.device, block_dim=block_dim)
 
 
@@ -135,6 +137,13 @@ def index_of(n: wp.vec3i, p: wp.vec3i) -> int:
 @wp.func
 def _around(x: int, n: int) -> int:
     return wp.where(x < 0, x + n, wp.where(x >= n, x - n, x))
+
+
+@wp.func
+def _ways(p: int, last: int, n: int, step: int) -> wp.vec3i:
+    """Returns the ways in memory from cell p to the cell before it, to itself and to the cell after cell `last`, on a
+    periodic axis of n cells that are `step` apart."""
+    return wp.vec3i(wp.where(p == 0, n - 1, -1) * step, 0, wp.where(last == n - 1, -p, last + 1 - p) * step)
 
 
 @wp.func
@@ -204,8 +213,11 @@ class MemoryFunctions:
     cell in the opposite directions. So a step writes where it has read, and needs one array (the AA pattern: Bailey et
     al., "Accelerating lattice Boltzmann fluid flow simulations using graphics processors", 2009). Two are faster.
 
+    For a group of two cells, i and i + 1, where i and Z are even, vecs have the populations of cell i, then those of
+    cell i + 1. Numbers of 16 bits that are side by side in memory are read and written at once.
+
     Attributes:
-        vec: vec of Q floats.
+        vec: vec of Q floats for each cell of the group.
         gather: (f, n, walled, i, parity) -> scaled vec, the populations that arrive at cell i.
         departed: (f, n, walled, i, parity) -> scaled vec, the populations that have left cell i.
         scatter: (f, n, walled, i, parity of f after it, scaled vec), writes the populations that leave cell i.
@@ -231,10 +243,15 @@ class MemoryFunctions:
 
 @functools.cache
 def memory_functions(
-    lattice_name: str, storage: str, walls: tuple[bool, bool, bool], wide: bool = True, in_place: bool = False
+    lattice_name: str,
+    storage: str,
+    walls: tuple[bool, bool, bool],
+    wide: bool = True,
+    in_place: bool = False,
+    group: int = 1,
 ) -> MemoryFunctions:
     """Builds (once) the functions for a lattice of `LATTICES` and a storage type of `STORAGES`, by whose scale numbers
-    are multiplied, with walls at rest that close some axes.
+    are multiplied, with walls at rest that close some axes; `group`, 1 or in 16 bits 2, is the number of cells at once.
 
     `wide` indexes populations in 64 bits, which adds a sixth to a step's instructions; otherwise there may be at most
     `NARROW` of them. Without `in_place`, every array has parity 0, whatever the parity that a function is given.
@@ -242,9 +259,9 @@ def memory_functions(
     c = lattice(lattice_name).c
     count = len(c)
     stored, scale = STORAGES[storage]
-    vec = wp.types.vector(count, float)
+    vec, cell_vec = wp.types.vector(group * count, float), wp.types.vector(count, float)
     index_type = wp.int64 if wide else wp.int32
-    elements = wp.types.vector(count, index_type)
+    elements = wp.types.vector(group * count, index_type)
 
     # Elements are read through the pointer: addresses from Warp's 64-bit strides would take half the time of a step.
 
@@ -253,6 +270,17 @@ def memory_functions(
 
     @wp.func_native("f.data[k] = value;")
     def poke(f: wp.array2d[stored], k: index_type, value: stored): ...
+
+    @wp.func_native("return *(const unsigned int*)(f.data + k);")
+    def peek_two(f: wp.array2d[stored], k: index_type) -> wp.uint32: ...
+
+    @wp.func_native("wp::half h; h.u = (unsigned short)pair; return wp::half_to_float(h);")
+    def half_of(pair: wp.uint32) -> float: ...
+
+    @wp.func_native(
+        "*(unsigned int*)(f.data + k) = wp::float_to_half(a).u | (unsigned int)wp::float_to_half(b).u << 16;"
+    )
+    def poke_two(f: wp.array2d[stored], k: index_type, a: float, b: float): ...
 
     @wp.func
     def element(f: wp.array2d[stored], q: int, i: int) -> index_type:
@@ -284,11 +312,12 @@ def memory_functions(
 
     @wp.func
     def sources(f: wp.array2d[stored], n: wp.vec3i, walled: wp.vec3i, i: int) -> elements:
-        """Returns the elements of the populations that arrive at cell i in an array of parity 0."""
+        """Returns the elements of the populations that arrive at a group of cells in an array of parity 0."""
         p = cell_of(n, i)
-        x = wp.vec3i(wp.where(p[0] == 0, n[0], p[0]) - 1, p[0], wp.where(p[0] == n[0] - 1, 0, p[0] + 1))
-        y = wp.vec3i(wp.where(p[1] == 0, n[1], p[1]) - 1, p[1], wp.where(p[1] == n[1] - 1, 0, p[1] + 1))
-        z = wp.vec3i(wp.where(p[2] == 0, n[2], p[2]) - 1, p[2], wp.where(p[2] == n[2] - 1, 0, p[2] + 1))
+        last = p[2] + wp.static(group - 1)
+        x = _ways(p[0], p[0], n[0], n[1] * n[2])
+        y = _ways(p[1], p[1], n[1], n[2])
+        z = _ways(p[2], last, n[2], 1)
         # Warp's hash of a function excludes `wp.static` expressions of loop variables: without these constants a gather
         # with other walls would have the same hash, and would be loaded instead.
         closed = wp.vec3i(wp.static(int(walls[0])), wp.static(int(walls[1])), wp.static(int(walls[2])))
@@ -296,62 +325,79 @@ def memory_functions(
         high = wp.vec3i()
         for a in range(3):
             low[a] = wp.where(p[a] == 0, closed[a] * walled[a], 0)
-            high[a] = wp.where(p[a] == n[a] - 1, closed[a] * walled[a], 0)
+            high[a] = wp.where(wp.where(a == 2, last, p[a]) == n[a] - 1, closed[a] * walled[a], 0)
         out = elements()
         for q in range(wp.static(count)):
-            row = x[wp.static(1 - c[q][0])] * n[1] + y[wp.static(1 - c[q][1])]
-            k = element(f, q, row * n[2] + z[wp.static(1 - c[q][2])])
-            if wp.static(any(walls[a] and c[q][a] != 0 for a in range(3))):
-                # Half-way bounce-back needs no branch: it reads another element.
-                back = bool(False)
-                for a in range(3):
-                    if wp.static(walls[a] and c[q][a] > 0):
-                        back = back or low[a] != 0
-                    if wp.static(walls[a] and c[q][a] < 0):
-                        back = back or high[a] != 0
-                k = wp.where(back, element(f, wp.static(OPPOSITE[q]), i), k)
-            out[q] = k
+            row = element(f, q, i + x[wp.static(1 - c[q][0])] + y[wp.static(1 - c[q][1])])
+            for m in range(wp.static(group)):
+                k = row + index_type(wp.static(m - c[q][2]))
+                if wp.static(not 0 <= m - c[q][2] < group):
+                    k = row + index_type(z[wp.static(1 - c[q][2])])
+                if wp.static(any(walls[a] and c[q][a] != 0 for a in range(3))):
+                    # Half-way bounce-back needs no branch: it reads another element.
+                    back = bool(False)
+                    for a in range(3):
+                        if wp.static(walls[a] and c[q][a] > 0 and (a < 2 or m == 0)):
+                            back = back or low[a] != 0
+                        if wp.static(walls[a] and c[q][a] < 0 and (a < 2 or m == group - 1)):
+                            back = back or high[a] != 0
+                    k = wp.where(back, element(f, wp.static(OPPOSITE[q]), i + m), k)
+                out[m * wp.static(count) + q] = k
         return out
+
+    # In the next two, `turned` exchanges opposite directions. All numbers of a group that stay at its cells are side by
+    # side, so that the elements k are not used; else only those that do not move along z are.
+
+    @wp.func
+    def read(f: wp.array2d[stored], i: int, k: elements, turned: bool, stay: bool) -> vec:
+        g = vec()
+        for q in range(wp.static(count)):
+            at = wp.where(turned, wp.static(OPPOSITE[q]), q)
+            if wp.static(group == 2) and (stay or wp.static(c[q][2] == 0)):
+                pair = peek_two(f, wp.where(stay, element(f, at, i), k[at]))
+                g[q] = half_of(pair)
+                g[wp.static(count) + q] = half_of(pair >> wp.uint32(16))
+            else:
+                for m in range(wp.static(group)):
+                    here = m * wp.static(count)
+                    g[here + q] = float(peek(f, wp.where(stay, element(f, at, i + m), k[here + at])))
+        return g
+
+    @wp.func
+    def write(f: wp.array2d[stored], i: int, k: elements, turned: bool, stay: bool, g: vec):
+        for q in range(wp.static(count)):
+            at = wp.where(turned, wp.static(OPPOSITE[q]), q)
+            if wp.static(group == 2) and (stay or wp.static(c[q][2] == 0)):
+                poke_two(f, wp.where(stay, element(f, at, i), k[at]), g[q], g[wp.static(count) + q])
+            else:
+                for m in range(wp.static(group)):
+                    here = m * wp.static(count)
+                    poke(f, wp.where(stay, element(f, at, i + m), k[here + at]), f.dtype(g[here + q]))
 
     @wp.func
     def gather(f: wp.array2d[stored], n: wp.vec3i, walled: wp.vec3i, i: int, parity: int) -> vec:
-        g = vec()
         if wp.static(in_place):
             if parity != 0:
-                for q in range(wp.static(count)):
-                    g[q] = float(peek(f, element(f, wp.static(OPPOSITE[q]), i)))
-                return g
-        k = sources(f, n, walled, i)
-        for q in range(wp.static(count)):
-            g[q] = float(peek(f, k[q]))
-        return g
+                return read(f, i, elements(), True, True)
+        return read(f, i, sources(f, n, walled, i), False, False)
 
     @wp.func
     def departed(f: wp.array2d[stored], n: wp.vec3i, walled: wp.vec3i, i: int, parity: int) -> vec:
-        g = vec()
         if wp.static(in_place):
             if parity != 0:
-                k = sources(f, n, walled, i)
-                for q in range(wp.static(count)):
-                    g[q] = float(peek(f, k[wp.static(OPPOSITE[q])]))
-                return g
-        for q in range(wp.static(count)):
-            g[q] = float(peek(f, element(f, q, i)))
-        return g
+                return read(f, i, sources(f, n, walled, i), True, False)
+        return read(f, i, elements(), False, True)
 
     @wp.func
     def scatter(f: wp.array2d[stored], n: wp.vec3i, walled: wp.vec3i, i: int, parity: int, left: vec):
         if wp.static(in_place):
             if parity != 0:
-                k = sources(f, n, walled, i)
-                for q in range(wp.static(count)):
-                    poke(f, k[wp.static(OPPOSITE[q])], f.dtype(left[q]))
+                write(f, i, sources(f, n, walled, i), True, False, left)
                 return
-        for q in range(wp.static(count)):
-            poke(f, element(f, q, i), f.dtype(left[q]))
+        write(f, i, elements(), False, True, left)
 
     @wp.func
-    def moments(g: vec):
+    def moments(g: cell_vec):
         drho = float(g[0])
         momentum = wp.vec3()
         diagonal = wp.vec3()

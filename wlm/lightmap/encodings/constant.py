@@ -25,7 +25,7 @@ class ConstantTiles(DeviceTiles):
         return (1.0 - share) * self._colours[:, before] + share * self._colours[:, after]
 
     def radiance(self, rows: np.ndarray, time: float) -> np.ndarray:
-        return np.broadcast_to(self.colours(time)[rows, None, None], (len(rows), TILE, TILE, 3))
+        return np.broadcast_to(self.colours(time)[rows, None, None], (len(rows), TILE, TILE, 3)).astype(np.float32)
 
 
 class Constant(Encoding):
