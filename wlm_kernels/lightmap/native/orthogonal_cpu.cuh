@@ -14,7 +14,8 @@ struct Product {
         }
     }
 };
-float x[M * M], gram[M * M], other[M * M], norm = 0.0f;
+// The first product adds nothing times x, whose columns beyond H must be finite.
+float x[M * M] = {}, gram[M * M], other[M * M], norm = 0.0f;
 const float* from = momentum.data + at;
 for (int i = 0; i < rows * H; ++i) norm += from[i] * from[i];
 const float inverse = norm > 0.0f ? 1.0f / sqrtf(norm) : 0.0f;
