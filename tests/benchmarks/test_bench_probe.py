@@ -18,7 +18,7 @@ PROFILES = [
     Profile(name="standard", ratio=0.1, latent=3, hidden=8, steps=STEPS),
     Profile(name="other", ratio=0.1, latent=3, hidden=8, steps=STEPS, support="sphere"),
 ]
-PCA = {"room": "27 components", "hall": "27 components"}
+PCA = {"room": "28 components", "hall": "27 components"}
 
 
 def room(seed: int, name: str):
