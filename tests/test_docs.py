@@ -101,9 +101,8 @@ def test_figures_are_those_of_the_benchmarks(document):
 
 def test_pages_of_results_are_those_that_the_command_makes(monkeypatch):
     monkeypatch.chdir(ROOT)
-    for name, page in pages(
-        ["benchmarks/nvidia-h200.json", "benchmarks/nvidia-h100.json", "benchmarks/cpu.json"], "docs/results.md"
-    ).items():
+    results = [f"benchmarks/{name}.json" for name in ("nvidia-h200", "nvidia-h100", "cpu")]
+    for name, page in pages(results, "docs/results.md").items():
         assert (DOCS / name).read_text(encoding="utf-8") == page, name
         rows = re.findall(r"^\| (?!---|method).*$", page, re.M)
         assert len(rows) <= 60 and max(map(len, (row.split("|") for row in rows)), default=0) <= 12, name

@@ -130,8 +130,7 @@ def start_workers(worker: tuple, place: Place, tasks: int) -> Workers:
         share = {"CPU": float(CPU_LANES)} if place.device == "cpu" else {"GPU": 1.0}
         return Actors(make, (place.device, *arguments), place.workers, tasks, place.cluster, share)
     threads = getattr(make, "threads", False) and place.device != "cpu"
-    if threads:
-        devices = list(dict.fromkeys(devices))
+    devices = list(dict.fromkeys(devices)) if threads else devices
     if len(devices) == 1:
         return Here(make(devices[0], *arguments))
     if threads:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from builders.atlas_meshes import charts, sheet, triangle
 from builders.atlas_models import KINDS, MIXED, random_model, save_plainly, shared_model
-from builders.checks import assert_same, put
+from builders.checks import assert_same, error_of, put
 from builders.resigned import rewrite
 
 import wlm
@@ -142,14 +142,11 @@ def test_blocks_that_are_none_of_the_format(tmp_path):
     beyond = {"lut": put((0, 0), pack_entries(np.array([16, 4]), np.array([8, 4]), True))}
     _refused(tmp_path, MIXED, "beyond the colour texture", tensors=beyond)
     blocks = {"colour": lambda v: np.zeros((1, 29, 16), np.uint8)}
-    _refused(
-        tmp_path, "plain", "colour is uint8 .1, 29, 16., expected uint8 .1, 30, 16.", tensors=blocks, stored="astc"
-    )
+    _refused(tmp_path, "plain", "colour is uint8 .1, 29, 16., expected uint8 .1, 30, 16", tensors=blocks, stored="astc")
     model = random_model(sheet(), "plain", "astc")
     save_plainly(model, tmp_path / "a.wlm")
     rewrite(tmp_path / "a.wlm", tensors={"colour": put((0, 7), 0)})  # a reserved mode
-    with pytest.raises(WlmError, match="a.wlm: astc: the block in row 1, column . is invalid"):
-        wlm.load(tmp_path / "a.wlm")
+    assert "a.wlm: astc: the block in row 1, column 1 is invalid" in error_of(wlm.load, tmp_path / "a.wlm")
 
 
 def test_a_texture_beyond_what_entries_reach(tmp_path):
@@ -160,8 +157,7 @@ def test_a_texture_beyond_what_entries_reach(tmp_path):
     assert not (tmp_path / "a.wlm").exists()
     save_plainly(model, tmp_path / "a.wlm")
     rewrite(tmp_path / "a.wlm", {"texels": [18, MOST_SIZE + 1]}, {"colour": wide.texels})
-    with pytest.raises(WlmError, match="at most 4096 texels along a side"):
-        wlm.load(tmp_path / "a.wlm")
+    assert "at most 4096 texels along a side" in error_of(wlm.load, tmp_path / "a.wlm")
 
 
 @pytest.mark.parametrize(
@@ -169,11 +165,7 @@ def test_a_texture_beyond_what_entries_reach(tmp_path):
     [
         ("lut", put((0, 0), np.array([36 << 4 | 7, 0, 0, 1])), "beyond the colour texture"),
         ("lut", put((0, 0), np.array([0, 0, 7, 1])), "names a factor beyond the last one"),
-        (
-            "lut",
-            put((0, 0), np.array([0, 0, 0, 1 << 8 | 1])),
-            "more coarse components, of one block each, than components",
-        ),
+        ("lut", put((0, 0), np.array([0, 0, 0, 1 << 8 | 1])), "more coarse components, of one block each, than"),
         ("lut", lambda v: np.ascontiguousarray(v[..., :3]), "expected entries of 2 or 4 numbers"),
         ("sheets", put((0, 0), 999), "expected the height and width in setting sizes"),
         ("sheets", put((0, 4), 3), "expected as many tiles as"),

@@ -2,6 +2,7 @@
 
 import json
 import math
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,6 @@ from wlm.atlas.data import LightmappedScene, from_arrays, join, load
 from wlm.atlas.evaluation import compare
 from wlm.atlas.listing import read_listing
 from wlm.atlas.stored import with_uvs
-from wlm.errors import WlmError
 from wlm.formats.exr import HALF_MAX, write_exr
 from wlm.formats.gltf import document_from_meshes, read_gltf
 from wlm.formats.gltf_writer import Replacement, write_glb
@@ -155,10 +155,7 @@ def test_no_uvs_no_triangles_and_other_names(tmp_path):
         ({"position": POSITION[:, :2]}, "position: expected numbers [N, 3], got float64 (4, 2)"),
         ({"triangle": TRIANGLE + 1}, "triangle: expected vertex numbers 0 to 3, found 1 to 4"),
         ({"mask": np.zeros((HEIGHT, WIDTH))}, "thing: mask: the mask is empty"),
-        (
-            {"position": _with(POSITION, (3, 1), np.nan)},
-            "POSITION of vertex 3: expected finite numbers, got (2, nan, 0)",
-        ),
+        ({"position": _with(POSITION, (3, 1), np.nan)}, "POSITION of vertex 3: expected finite numbers, got (2, nan"),
         ({"uv": _with(UV, (2, 0), np.nan)}, "TEXCOORD_0 of vertex 2: expected finite numbers, got (nan, "),
         ({"lightmap": _with(_lightmap(), np.s_[:3], np.nan)}, "lightmap: expected a finite texel inside the mask"),
     ],
@@ -208,9 +205,7 @@ def test_one_triangle_within_a_texel():
     uv = np.array([[0.51, 0.52], [0.52, 0.52], [0.51, 0.53]])
     mesh = from_arrays(POSITION[:3], TRIANGLE[:1], uv, _lightmap())
     assert np.argwhere(mesh.sheets[0].mask).tolist() == [[3, 4]]
-    assert mesh.warnings == (
-        "array: all triangles together have 0.0024 texels of 8 x 6 in TEXCOORD_0: are its UVs in [0, 1]?",
-    )
+    assert mesh.warnings[0].startswith("array: all triangles together have 0.0024 texels of 8 x 6 in TEXCOORD_0: are")
 
 
 def test_broken_texels_are_repaired_as_stated():
@@ -338,10 +333,8 @@ def _holds_centres(corner: np.ndarray, margin: float) -> np.ndarray:
     """Which centres lie further within a triangle than the margin, bool [HEIGHT, WIDTH]."""
     y, x = np.mgrid[0:HEIGHT, 0:WIDTH] + 0.5
     (ax, ay), (bx, by), (cx, cy) = corner if _twice_area(corner) > 0 else corner[::-1]
-    sides = [
-        (qx - px) * (y - py) - (qy - py) * (x - px)
-        for (px, py), (qx, qy) in (((ax, ay), (bx, by)), ((bx, by), (cx, cy)), ((cx, cy), (ax, ay)))
-    ]
+    corners = ((ax, ay), (bx, by), (cx, cy), (ax, ay))
+    sides = [(qx - px) * (y - py) - (qy - py) * (x - px) for (px, py), (qx, qy) in pairwise(corners)]
     return np.min(sides, axis=0) > margin
 
 
@@ -370,8 +363,7 @@ def picture(path, size):
 
 
 def test_each_picture_of_a_folder_is_a_sheet(tmp_path):
-    with pytest.raises(WlmError, match=f"{tmp_path}: expected lightmaps"):
-        read_listing(tmp_path)
+    assert f"{tmp_path}: expected lightmaps" in error_of(read_listing, tmp_path)
     for name, size in (("wall.exr", 16), ("box.exr", 32)):
         picture(tmp_path / name, size)
     (tmp_path / "notes.txt").write_text("none")
@@ -407,16 +399,12 @@ def test_a_lightmap_goes_to_the_mesh_that_it_fits(tmp_path):
     write_exr(tmp_path / "a.exr", baked(uv))
     mesh = load(scene, tmp_path / "a.exr")
     assert [part.primitive.label for part in mesh.sheets[0].parts] == ["crate"]
-    assert mesh.warnings == (
-        "a: 2 meshes lie on each other in TEXCOORD_0: the lightmap fits crate best; the others are left out",
-    )
+    assert mesh.warnings[0].startswith("a: 2 meshes lie on each other in TEXCOORD_0: the lightmap fits crate best")
     for name in ("lamp", "lamp-mesh", "1"):
         assert [part.primitive.node for part in load(scene, tmp_path / "a.exr", node=name).sheets[0].parts] == [1]
     assert "node: expected one of crate, lamp, found 'wall'" in error_of(load, scene, tmp_path / "a.exr", node="wall")
     write_exr(tmp_path / "grey.exr", np.ones((MAP_SIDE, MAP_SIDE, 3)))
-    assert "fits none clearly better: expected the name of one as the node (--node): crate, lamp" in error_of(
-        load, scene, tmp_path / "grey.exr"
-    )
+    assert "expected the name of one as the node (--node): crate, lamp" in error_of(load, scene, tmp_path / "grey.exr")
     # Side by side in one atlas they share it, and so does a second node with the same mesh.
     side = [Thing("a", position, triangle, [uv * [0.5, 1]]), Thing("b", position, triangle, [uv * [0.5, 1] + [0.5, 0]])]
     write_scene(scene, [*side, Thing("c", like=0)])

@@ -176,11 +176,8 @@ def test_curves_and_solved():
     error = grid.curves(tiles, sizes, Stages("cpu")).numpy()
     assert error.shape == (3, 9) and error.dtype == np.float64
     chosen = np.arange(9) % 3
-    samples = {
-        i: pair
-        for members, *parts in grid.solved(tiles, sizes, chosen)
-        for i, *pair in zip(members.tolist(), *parts, strict=True)
-    }
+    solved = grid.solved(tiles, sizes, chosen)
+    samples = {i: pair for members, *parts in solved for i, *pair in zip(members.tolist(), *parts, strict=True)}
     assert sorted(samples) == list(range(9))
     for i, (values, weight) in samples.items():
         size = sizes[chosen[i]]

@@ -104,9 +104,7 @@ def test_pictures_inside_the_file(tmp_path):
         assert_lit(inside, atol=atol)
         assert any(PNG_8 in line for line in inside.warnings) == (data[:4] == b"\x89PNG")
         maker = GltfMaker()
-        maker.content |= {
-            key: value for key, value in content.items() if key not in ("accessors", "bufferViews", "buffers")
-        }
+        maker.content |= {key: content[key] for key in content.keys() - {"accessors", "bufferViews", "buffers"}}
         attributes = {"POSITION": maker.add(np.float32(POSITION)), "TEXCOORD_1": maker.add(np.float32(UV))}
         corners = maker.add(np.uint32(TRIANGLE).reshape(-1))
         maker.content["meshes"] = [{"primitives": [{"attributes": attributes, "indices": corners, "material": 0}]}]
@@ -128,9 +126,8 @@ def test_images_by_percent_encoding_and_extension(tmp_path):
     assert "expected an image that can be read, found EXT_texture_avif" in error_of(
         load, scene(tmp_path, moz(), textures=[{"extensions": {"EXT_texture_avif": {"source": 0}}}])
     )
-    assert "expected a path relative to the document" in error_of(
-        load, scene(tmp_path, moz(), images=[{"uri": "https://example.org/a.exr"}])
-    )
+    images = [{"uri": "https://example.org/a.exr"}]
+    assert "a path relative to the document" in error_of(load, scene(tmp_path, moz(), images=images))
 
 
 NODE = {"MX_lightmap": {"lightMapTexture": {"index": 0}, "scale": [0.5, 0.5], "offset": [0.5, 0.0], "intensity": 2}}
@@ -167,10 +164,8 @@ def test_lightmaps_of_other_extensions(tmp_path, writer):
     (place,) = found.objects
     rectangle = (0.5, 0.5, 0.5, 0.0) if writer in ("MX", "EPIC", "NEEDLE") else (1.0, 1.0, 0.0, 0.0)
     assert place.scale_offset == rectangle and found.uv_set == 1
-    assert any(
-        line.endswith(f"1 lightmap of {next(iter(WRITERS[writer][0] or WRITERS[writer][2] or NODE))}")
-        for line in found.warnings
-    )
+    extension = next(iter(WRITERS[writer][0] or WRITERS[writer][2] or NODE))
+    assert any(line.endswith(f"1 lightmap of {extension}") for line in found.warnings)
     sheet, factor = found.sheets[0], 1.0 if writer in ("EPIC", "NEEDLE") else 2.0
     lit = (light()[sheet.mask] > 0).all(axis=1)
     np.testing.assert_allclose(sheet.lightmap[sheet.mask][lit], factor * light()[sheet.mask][lit], rtol=1e-3)
@@ -205,12 +200,9 @@ def test_lightmaps_that_are_named_and_cannot_be_read(tmp_path):
     with changed(path) as content:
         content["nodes"][0]["extensions"]["NEEDLE_components"]["builtin_components"][0]["lightmapIndex"] = 65535
     assert "NEEDLE_lightmaps: no mesh of the scene has such" in error_of(load, path)
-    assert "its extension ABC_lightmap is not known" in error_of(
-        load, scene(tmp_path, {}, extensionsUsed=["ABC_lightmap"])
-    )
-    assert "texCoord" not in error_of(load, scene(tmp_path, moz(index=3))) and "textures[3]" in error_of(
-        load, tmp_path / "a.gltf"
-    )
+    assert "its extension A_lightmap is not known" in error_of(load, scene(tmp_path, {}, extensionsUsed=["A_lightmap"]))
+    assert "texCoord" not in error_of(load, scene(tmp_path, moz(index=3)))
+    assert "textures[3]" in error_of(load, tmp_path / "a.gltf")
 
 
 def test_a_material_slot_as_a_choice(tmp_path):
@@ -242,9 +234,8 @@ def two_materials(folder, first, second, uvs=(OTHER, UV)):
 
 def test_one_image_in_two_textures(tmp_path):
     assert_lit(load(two_materials(tmp_path, moz(), moz(index=1))))
-    assert "expected one lightmap for all of its materials" in error_of(
-        load, two_materials(tmp_path, moz(), moz(index=1, intensity=2.0))
-    )
+    other = moz(index=1, intensity=2.0)
+    assert "expected one lightmap for all of its materials" in error_of(load, two_materials(tmp_path, moz(), other))
 
 
 def moved(uv, scale, offset):
@@ -389,11 +380,8 @@ def test_udim_tiles(tmp_path):
 
 def test_bakes_named_after_their_mesh(tmp_path):
     """The names decide where the light can't, for nodes that share a mesh too."""
-    things = [
-        Thing("Floor", POSITION, TRIANGLE, [UV]),
-        Thing("Floor.001", like=0),
-        Thing("Big Wall", POSITION, TRIANGLE, [UV]),
-    ]
+    names = ("Floor", POSITION, TRIANGLE, [UV]), ("Big Wall", POSITION, TRIANGLE, [UV])
+    things = [Thing(*names[0]), Thing("Floor.001", like=0), Thing(*names[1])]
     path = write_scene(tmp_path / "room.gltf", things)
     folder = tmp_path / "Lightmaps"
     folder.mkdir()
@@ -409,10 +397,8 @@ def test_bakes_named_after_their_mesh(tmp_path):
     (folder / "big-wall_baked.exr").rename(folder / "other.exr")
     text = error_of(load, path, folder)
     assert "--node" not in text and "in the lightmap's file name, or a .json list" in text
-    things = [
-        Thing("Floor", POSITION, TRIANGLE, [UV * [0.5, 1]]),
-        Thing("Wall", POSITION, TRIANGLE, [UV * [0.5, 1] + [0.5, 0]]),
-    ]
+    half = UV * [0.5, 1]
+    things = [Thing(name, POSITION, TRIANGLE, [half + [x, 0]]) for name, x in (("Floor", 0), ("Wall", 0.5))]
     text = error_of(load, write_scene(path, things), folder)
     assert "are both lightmaps of Floor" in text
 
@@ -511,9 +497,8 @@ def test_lightmaps_are_bounded_together(tmp_path, monkeypatch):
     """Many materials that read one image with different factors decode it as often."""
     monkeypatch.setattr("wlm.atlas.data.FRAMES", 3 * 12 * SIDE * SIDE)
     monkeypatch.setattr("wlm.atlas.data.PICTURE_GROWTH", 1)
-    things = [
-        Thing(f"b{i}", POSITION + i, TRIANGLE, [UV], material=moz(texCoord=0, intensity=1.0 + i)) for i in range(4)
-    ]
+    material = [moz(texCoord=0, intensity=1.0 + i) for i in range(4)]
+    things = [Thing(f"b{i}", POSITION + i, TRIANGLE, [UV], material=each) for i, each in enumerate(material)]
     write_exr(tmp_path / EXR, light())
     path = write_scene(tmp_path / "a.gltf", things, {"images": [{"uri": EXR}], "textures": [{"source": 0}]})
     assert "its lightmaps: expected at most" in error_of(load, path)

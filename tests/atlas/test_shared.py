@@ -247,11 +247,8 @@ def test_a_sample_of_many_tiles_says_whether_apart_comes_near(unlike, monkeypatc
 def files(folder, states=("day", "night")):
     position, triangle, uv = box((0, 0, 0), (2, 2, 2))
     half = uv * [0.5, 1.0]
-    things = [
-        Thing("left", position, triangle, [uv, uv]),
-        Thing("right", like=0, translation=(4, 0, 0)),
-        Thing("rock", position + [0, 0, 4], triangle, [uv]),
-    ]
+    things = [Thing("left", position, triangle, [uv, uv]), Thing("right", like=0, translation=(4, 0, 0))]
+    things += [Thing("rock", position + [0, 0, 4], triangle, [uv])]
     path = write_scene(folder / "scene.gltf", things)
     for i, state in enumerate(states):
         write_exr(folder / f"{state}.exr", lights(i)[0])
@@ -303,10 +300,8 @@ def test_materials_own_lightmaps(tmp_path):
         return {"extensions": {"MOZ_lightmap": {"index": 0, "texCoord": 0, "intensity": 2.0} | more}}
 
     shift = {"extensions": {"KHR_texture_transform": {"scale": [0.5, 0.5], "offset": [0.5, 0.5]}}}
-    things = [
-        Thing("a", position, triangle, [uv * 0.5], material=material()),
-        Thing("b", position + 3, triangle, [uv], material=material(**shift)),
-    ]
+    meshes = ("a", position, triangle, [uv * 0.5]), ("b", position + 3, triangle, [uv])
+    things = [Thing(*meshes[0], material=material()), Thing(*meshes[1], material=material(**shift))]
     images = {"textures": [{"source": 0}], "images": [{"uri": "day.exr", "name": "baked"}]}
     path = write_scene(tmp_path / "scene.gltf", things, images)
     write_exr(tmp_path / "day.exr", lights(0)[0])

@@ -13,10 +13,7 @@ from benchmarks.app import _COMMANDS, app
 
 # Words that set each option, and the argument of `run` that they give; result files name files without their folders.
 OPTIONS = {
-    **{
-        flag.replace("-", "_"): ([f"--{flag}"], True)
-        for flag in ("quick", "rivals-only", "speed", "table", "volume-only")
-    },
+    **{name.replace("-", "_"): ([f"--{name}"], True) for name in "quick rivals-only speed table volume-only".split()},
     **{name: ([f"--no-{name}"], False) for name in ("rivals", "parts")},
     "profiles": (["--profile", "M", "--profile", "a/b.yaml"], ["M", "a/b.yaml"]),
     "profile": (["--profile", "cascade"], "cascade"),

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 from builders.bench_rows import keys
+from builders.checks import error_of
 
 from benchmarks.probe_table import RIVALS, nearest_probes, table_rows
-from wlm.errors import WlmError
 from wlm.probe.data import from_arrays
 from wlm.probe.evaluation import by_distance, score
 from wlm.probe.fit import compress
@@ -87,5 +87,4 @@ def test_the_nearest_probes_are_around_the_middle(probes):
     middle = (probes.position[probes.live].min(0) + probes.position[probes.live].max(0)) / 2
     assert part.live.all() and np.abs(part.position - middle).max() < 2.0
     for count in (0, 271):
-        with pytest.raises(WlmError, match="expected 1 to 270 live probes"):
-            nearest_probes(probes, count)
+        assert "expected 1 to 270 live probes" in error_of(nearest_probes, probes, count)

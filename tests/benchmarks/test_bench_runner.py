@@ -1,4 +1,4 @@
-"""Rows, their files, tables and pages, and what all benches share."""
+"""Rows, their files, tables and pages, what all benches share, how calls are timed, and the simulated growth."""
 
 import json
 import math
@@ -8,8 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from builders.bench_rows import ENVIRONMENT
+from builders.checks import error_of, misuse_of
 
-from benchmarks import Row, Run, Timing, pages, read_json, read_runs, tables, write_json
+from benchmarks import Row, Run, Timing, growth, pages, read_json, read_runs, tables, time_together, timing, write_json
+from benchmarks.growth import CORES, STORAGE, Costs, run, simulate
 from benchmarks.runner import Bench, exact_errors
 from wlm.errors import WlmError
 
@@ -32,8 +34,7 @@ def test_figures_are_known_finite_and_plain():
     )
     assert row.figures == {"psnr": 2.5, "bytes": 3} and type(row["psnr"]) is float and type(row["bytes"]) is int
     assert row.get("ssim") is None and row.with_figures(ssim=1.0, psnr=None).figures == {"bytes": 3, "ssim": 1.0}
-    with pytest.raises(ValueError, match="unknown measured quantity 'speed'"):
-        row.with_figures(speed=1.0)
+    assert "unknown measured quantity 'speed'" in misuse_of(row.with_figures, speed=1.0)
 
 
 def test_a_run_keeps_what_other_systems_and_scenes_left(tmp_path):
@@ -107,8 +108,7 @@ def test_a_bench_times_its_rows_and_stores_its_fits():
     for row in timed:
         assert set(row.figures) == {"decode_ms", "decode_ms_spread"} and row["decode_ms"] > 0.0
     assert bench.missing_row("PCA", "half", WlmError("no room")).notes == "not measured: no room"
-    with pytest.raises(WlmError, match="tpu"):
-        Bench("probe", "tpu")
+    assert "tpu" in error_of(Bench, "probe", "tpu")
 
 
 def test_times_of_a_call_that_does_several_things():
@@ -161,9 +161,84 @@ def test_pages_by_system(tmp_path, monkeypatch):
     lightmap = made["all/lightmap.md"]
     assert "| ours | M | b | 1,234,567 | 0.676 | 42.50 | 40.00 |" in lightmap and "| ours | M | a |" not in lightmap
     assert "- `python -m benchmarks --json b.json`: cpu, 1 threads, Python 3, Warp 1, torch 2, 2026-01-02" in lightmap
-    assert (
-        "| coarse march | step 2 | a | 1 | 50.00 |" in made["all/smoke.md"]
-        and "another" not in made["all/smoke.md"]
-    )
+    assert "| coarse march | step 2 | a | 1 | 50.00 |" in made["all/smoke.md"] and "another" not in made["all/smoke.md"]
     write_json("c.json", [replace(OURS, option=str(i)) for i in range(90)], ENVIRONMENT)
     assert pages(["c.json"])["results/lightmap.md"].count("\n| ours") == 60
+
+
+def fake_clock(monkeypatch, seconds_a_call):
+    """A clock that only calls move, by name."""
+    now = [0.0]
+    log = []
+
+    def make(name):
+        def call():
+            log.append(name)
+            now[0] += seconds_a_call[name]
+
+        return call
+
+    monkeypatch.setattr(timing.time, "perf_counter", lambda: now[0])
+    return {name: make(name) for name in seconds_a_call}, log
+
+
+def test_distribution_is_of_one_call(monkeypatch):
+    now = [0.0]
+    durations = iter([9.0, 9.0, 9.0, *(k / 1000.0 for k in (2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22))])
+
+    def call():
+        now[0] += next(durations)
+
+    monkeypatch.setattr(timing.time, "perf_counter", lambda: now[0])
+    # Two calls to warm up and one to see how long a call is are not in the distribution.
+    result = time_together({"": call}, warmup=2, repeats=11)[""]
+    assert result.n == 11
+    assert (result.median_ms, result.p10_ms, result.p90_ms) == pytest.approx((12.0, 4.0, 20.0))
+
+
+def test_short_calls_are_batched_to_a_millisecond(monkeypatch):
+    calls, log = fake_clock(monkeypatch, {"a": 0.0003})
+    result = time_together(calls, warmup=1, repeats=3)["a"]
+    assert len(log) == 1 + 1 + 3 * 4
+    assert result.median_ms == pytest.approx(0.3)
+
+
+def test_a_call_that_takes_no_time_ends(monkeypatch):
+    calls, log = fake_clock(monkeypatch, {"a": 0.0})
+    assert time_together(calls, warmup=1, repeats=1)["a"].median_ms == 0.0
+    assert len(log) == 2 + 1000
+
+
+def test_peers_take_turns_and_the_first_changes(monkeypatch):
+    calls, log = fake_clock(monkeypatch, {"a": 0.01, "b": 0.02, "c": 0.03})
+    result = time_together(calls, warmup=2, repeats=3)
+    assert log[:9] == ["a"] * 3 + ["b"] * 3 + ["c"] * 3
+    assert "".join(log[9:]) == "abcbcacab"
+    assert {name: t.median_ms for name, t in result.items()} == pytest.approx({"a": 10, "b": 20, "c": 30})
+
+
+def test_bounds():
+    """Each resource alone bounds the time; GPUs halve it until the storage that all share is always busy."""
+    costs = Costs(read=0.1 * STORAGE, written=0.0, core_seconds=0.5 * CORES, gpu_seconds=2.0)
+    one, eight, many = (simulate(costs, gpus, 2000) for gpus in (1, 8, 64))
+    assert one.seconds == pytest.approx(2000 * 2.0, rel=0.01) and one.gpus > 0.99
+    assert eight.seconds == pytest.approx(one.seconds / 8, rel=0.01)
+    assert many.seconds == pytest.approx(2000 * 0.1, rel=0.03) and many.storage > 0.97 and many.gpus < 0.35
+    slow = simulate(Costs(0.1 * STORAGE, 0.0, 4.0 * CORES, 2.0), 8, 2000)
+    assert slow.seconds == pytest.approx(2000 * 4.0 / 8, rel=0.01) and slow.cores > 0.98
+
+
+def test_failures(monkeypatch: pytest.MonkeyPatch):
+    """A GPU that fails repeats its lightmap, and nothing is lost or done twice."""
+    monkeypatch.setattr(growth, "HOURS_TO_FAIL", 0.05)
+    costs = Costs(0.001 * STORAGE, 0.0, 0.01, 2.0)
+    failing = simulate(costs, 4, 1000)
+    assert failing.repeated > 3
+    assert failing.seconds * failing.gpus * 4 == pytest.approx(1000 * 2.0 + failing.repeated, rel=0.02)
+
+
+def test_rows():
+    first, *rows = run(quick=True, device="cpu")
+    assert first["read_bytes"] > 1e8 and first["core_seconds"] > 0.0 and first["fit_seconds"] > 1.0
+    assert [row.option for row in rows] == ["1 GPU", "8 GPUs", "64 GPUs"]
+    assert rows[0]["hours"] > rows[1]["hours"] > rows[2]["hours"]

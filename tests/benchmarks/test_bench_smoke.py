@@ -86,9 +86,7 @@ def test_a_frame_is_the_sum_of_its_stages(rows):
     assert total["frame_rate"] == pytest.approx(1e3 / total["time_ms"])
     assert frame["air alone"]["time_ms"] < frame["simulation"]["time_ms"]
     drawn = {f"all orders{what}" for what in (", drawn", ", no obstacle", " of a point light", " of fire")}
-    assert drawn | {"six ways, drawn", *(f"six planes by paths, {what}" for what in ("one order", "all orders"))} < set(
-        frame
-    )
+    assert drawn | {"six ways, drawn", *(f"six planes by paths, {n}" for n in ("one order", "all orders"))} < set(frame)
 
 
 def test_several_devices_are_as_one(rows):

@@ -19,15 +19,8 @@ SINGLE = GridSizes((12, 16), extinctions=(20.0,), pixels=10, samples=64)
 SMALL = {"plumes": 1, "pixels": 10, "samples": 96, "scale": 0.08, "frames": 20, "sides": 1}
 OTHER = {"views": 1, "samples": 32, "cells": 12}
 TINY = replace(QUICK, **SMALL, repeats=1, single=SINGLE, other=OTHER)
-WAYS = (
-    "single scattering",
-    "single x gain",
-    "three octaves",
-    "fitted octaves",
-    "fitted filter",
-    "diffusion",
-    "learned mix",
-)
+SCATTERING = ("single scattering", "single x gain", "three octaves", "fitted octaves", "fitted filter")
+WAYS = (*SCATTERING, "diffusion", "learned mix")
 
 
 @pytest.fixture(scope="module")

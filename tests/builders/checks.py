@@ -13,7 +13,16 @@ from wlm.metrics import psnr_from_mse
 
 def error_of(call: Callable, *args: Any, **options: Any) -> str:
     """The error that a call must end with; it is one line."""
-    with pytest.raises(WlmError) as caught:
+    return _line_of(WlmError, call, *args, **options)
+
+
+def misuse_of(call: Callable, *args: Any, **options: Any) -> str:
+    """The error of a call that no program should make."""
+    return _line_of(ValueError, call, *args, **options)
+
+
+def _line_of(kind: type[Exception], call: Callable, *args: Any, **options: Any) -> str:
+    with pytest.raises(kind) as caught:
         call(*args, **options)
     text = str(caught.value)
     assert "\n" not in text

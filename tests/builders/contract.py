@@ -63,11 +63,8 @@ def _groups(model: Any) -> dict[str, np.ndarray]:
 
 
 def _layers(model: Any) -> dict[str, np.ndarray]:
-    return {
-        f"{atlas}_{layer}": values[:24:2, :24:2]
-        for atlas, layers in model.decoder().frames(18.5).items()
-        for layer, values in layers.items()
-    }
+    atlases = model.decoder().frames(18.5).items()
+    return {f"{atlas}_{name}": light[:24:2, :24:2] for atlas, layers in atlases for name, light in layers.items()}
 
 
 def _probes(model: Any) -> dict[str, np.ndarray]:

@@ -40,10 +40,8 @@ def write_glb(path: Path, squares: list[dict[str, np.ndarray]]) -> Path:
     """Writes squares, each as a mesh of its own."""
     maker = GltfMaker()
     corners = maker.add(np.array([0, 1, 2, 0, 2, 3], np.uint16))
-    meshes = [
-        {"primitives": [{"attributes": {n: maker.add(a) for n, a in each.items()}, "indices": corners}]}
-        for each in squares
-    ]
+    primitives = [{"attributes": {n: maker.add(a) for n, a in each.items()}, "indices": corners} for each in squares]
+    meshes = [{"primitives": [each]} for each in primitives]
     nodes = [{"mesh": i} for i in range(len(meshes))]
     maker.content |= {"scene": 0, "scenes": [{"nodes": list(range(len(nodes)))}], "nodes": nodes, "meshes": meshes}
     return maker.save(path)

@@ -24,9 +24,8 @@ def exr_header(
         compression: Number of the compression; 3 is ZIP, 13 zstd.
         flags: Flags of the version: 0x200 tiles, 0x800 deep data, 0x1000 several parts.
     """
-    channels = (
-        b"".join(name.encode() + b"\0" + struct.pack("<iB3xii", kind, 0, sampling, sampling) for name in names) + b"\0"
-    )
+    sampled = struct.pack("<iB3xii", kind, 0, sampling, sampling)
+    channels = b"".join(name.encode() + b"\0" + sampled for name in names) + b"\0"
     box = struct.pack("<4i", *window)
     fields = [
         ("channels", "chlist", channels),

@@ -19,9 +19,8 @@ class GltfMaker:
 
     def view(self, data: bytes, **extra: object) -> int:
         self.blob += bytes(-len(self.blob) % 4)
-        self.content["bufferViews"].append(
-            {"buffer": 0, "byteOffset": len(self.blob), "byteLength": len(data), **extra}
-        )
+        place = {"buffer": 0, "byteOffset": len(self.blob), "byteLength": len(data)}
+        self.content["bufferViews"].append(place | extra)
         self.blob += data
         return len(self.content["bufferViews"]) - 1
 

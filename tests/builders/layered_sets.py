@@ -50,11 +50,8 @@ def small_layers(height=128, width=128, hours=HOURS, period=24.0) -> LightmapSet
     light, directions = moving_light(height, width, hours).light.frames, turning_directions(height, width, hours)
     mask = np.zeros((len(hours), height, width, 3), np.float32)
     mask[..., 1] = mask[..., 2] = light[..., 0] / light.max()
-    layers = [
-        Layer(light, "light"),
-        Layer(directions, "dir", encoding="signed"),
-        Layer(mask, "shadow", encoding="unit"),
-    ]
+    layers = [Layer(light, "light"), Layer(mask, "shadow", encoding="unit")]
+    layers.insert(1, Layer(directions, "dir", encoding="signed"))
     return from_layers(layers, hours, period=period, name="layers")
 
 
@@ -76,12 +73,8 @@ def write_unity(folder: Path, hours=(0.0, 12.0), atlases=2) -> None:
 
 def write_set_json(folder: Path, **changes: object) -> Path:
     """Writes a `set.json` of one atlas and one state over `a.exr`; a change to None takes its key out."""
-    content = {
-        "name": "room",
-        "layers": {"light": "radiance"},
-        "atlases": {"0": {}},
-        "lightmaps": [{"time_hours": 3.0, "files": {"0": {"light": "a.exr"}}}],
-    }
+    content = {"name": "room", "layers": {"light": "radiance"}, "atlases": {"0": {}}}
+    content["lightmaps"] = [{"time_hours": 3.0, "files": {"0": {"light": "a.exr"}}}]
     content = {key: value for key, value in (content | changes).items() if value is not None}
     (folder / "set.json").write_text(json.dumps(content))
     return folder / "set.json"

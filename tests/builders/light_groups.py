@@ -39,10 +39,8 @@ def few_texels() -> LightmapModel:
     """A model of two groups whose file is small: constants and frames of a few valid texels."""
     mask = np.zeros((108, 247), bool)
     mask[7:9, 100:140] = True
-    sheets = {
-        "sky": random_sheet((1, 4), times=(0.0, 7.5, 19.0), seed=1, mask=mask),
-        "lamp": random_sheet((4, 1), times=(0.0,), seed=2, mask=mask),
-    }
+    sheets = {"sky": random_sheet((1, 4), times=(0.0, 7.5, 19.0), seed=1, mask=mask)}
+    sheets["lamp"] = random_sheet((4, 1), times=(0.0,), seed=2, mask=mask)
     named = {replace(LIGHT, group=group): own for group, own in sheets.items()}
     return LightmapModel("few texels", "0123456789abcdef", sheets["sky"].profile, named)
 

@@ -96,6 +96,7 @@ def _smoke(density: np.ndarray, lights: int = 2, emitting: bool = True, distance
 
 _BLOCKS = {"endpoints": uniform(0.1, 0.9, 2, 3, 2, 4), "weights": uniform(0.1, 0.9, 8, 12)}
 _BEYOND = {"endpoints": uniform(-0.3, 1.3, 2, 3, 2, 4), "weights": uniform(-0.3, 1.3, 8, 12)}
+_FEW, _ANYWHERE, _SPHERE = points_between(50, 8, 4), uniform(0.0, 1.0, 80, 3), {"support": "sphere"}
 _THIN = uniform(0.05, 0.3, 6, 7, 8)
 _THIRDS = {"xy": normal(4, 5, 3), "xz": normal(6, 5, 3, seed=9), "yz": normal(6, 4, 3, seed=10)}
 _SPACE = {"points": points_between(60, 60, 60, 60)}
@@ -106,11 +107,7 @@ CASES = {
     "bc7_map-quantised": Case("bc7_map", {**_BEYOND, "uv": points_between(50, 12, 8)}, options={"quantised": True}),
     "bc7_map-layers": Case(
         "bc7_map",
-        {
-            "endpoints": uniform(0.1, 0.9, 3, 1, 2, 2, 4),
-            "weights": uniform(0.1, 0.9, 3, 4, 8),
-            "uv": points_between(50, 8, 4),
-        },
+        {"endpoints": uniform(0.1, 0.9, 3, 1, 2, 2, 4), "weights": uniform(0.1, 0.9, 3, 4, 8), "uv": _FEW},
         {"layer": _layers(50, 3)},
     ),
     "bc7_texels": Case("bc7_texels", _BLOCKS),
@@ -135,14 +132,8 @@ CASES = {
     **{f"mlp-{width}": Case("mlp", network_of(16, width, 3, 3)) for width in (8, 16, 17, 32, 64)},
     "mlp-tanh": Case("mlp", network_of(5, 16, 4, 2), options={"gelu": "tanh"}),
     "mlp-fast": Case("mlp", network_of(5, 17, 1), options={"gelu": "fast"}),
-    "gaussian_sum": Case(
-        "gaussian_sum", {"rows": gaussians(24, 5), "points": uniform(0.0, 1.0, 80, 3)}, options={"cut": 6.0}
-    ),
-    "gaussian_sum-sphere": Case(
-        "gaussian_sum",
-        {"rows": gaussians(9, 17), "points": uniform(0.0, 1.0, 80, 3)},
-        options={"support": "sphere"},
-    ),
+    "gaussian_sum": Case("gaussian_sum", {"rows": gaussians(24, 5), "points": _ANYWHERE}, options={"cut": 6.0}),
+    "gaussian_sum-sphere": Case("gaussian_sum", {"rows": gaussians(9, 17), "points": _ANYWHERE}, options=_SPHERE),
     "gaussian_sum-lists": Case(
         "gaussian_sum",
         {"rows": gaussians(300, 1), "points": uniform(0.0, 1.0, 500, 3)},

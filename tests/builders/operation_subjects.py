@@ -9,12 +9,7 @@ from builders.operation_cases import CASES, normal
 
 from wlm import ops
 
-WITHOUT = {
-    "Raster": "a class",
-    "bc7_blocks": "refuses gradients",
-    "funcs": "for use inside kernels",
-    "plain": "the references in torch",
-}
+WITHOUT = {"Raster": "a class", "bc7_blocks": "refuses gradients", "funcs": "for kernels", "plain": "the references"}
 """Names of `wlm.ops` that aren't differentiable operations."""
 
 

@@ -49,11 +49,8 @@ def three_scene() -> dict[str, Any]:
         matrix = np.eye(4)
         matrix[3, :3] = shift
         groups.append({"type": "Group", "name": "probes", "matrix": matrix.ravel().tolist(), "children": children})
-    scene = {
-        "type": "Scene",
-        "uuid": "a",
-        "children": [*groups, {"type": "Mesh", "matrix": np.eye(4).ravel().tolist()}],
-    }
+    mesh = {"type": "Mesh", "matrix": np.eye(4).ravel().tolist()}
+    scene = {"type": "Scene", "uuid": "a", "children": [*groups, mesh]}
     return {"metadata": {"version": 4.6, "type": "Object", "generator": "Object3D.toJSON"}, "object": scene}
 
 
@@ -140,10 +137,8 @@ def tables() -> dict[str, str]:
     mixed = np.concatenate([position, light.transpose(0, 2, 1).reshape(COUNT, 27), np.ones((COUNT, 1))], 1)
     named += [f"{i}," + ",".join(f"{x:.9g}" for x in row) for i, row in enumerate(mixed)]
     spaced = ["# x y z and SH", *(" ".join(f"{x:.9g}" for x in row) for row in rows)]
-    tabs = [
-        "x\ty\tz\t" + "\t".join(f"sh_{i + 1}" for i in range(27)),
-        *("\t".join(f"{x:.9g}" for x in r) for r in rows),
-    ]
+    tabs = "x\ty\tz\t" + "\t".join(f"sh_{i + 1}" for i in range(27))
+    tabs = [tabs, *("\t".join(f"{x:.9g}" for x in r) for r in rows)]
     return {
         "commas.csv": "\n".join(",".join(f"{x:.9g}" for x in row) for row in rows),
         "named.csv": "\ufeff" + "\r\n".join(named),

@@ -76,10 +76,8 @@ def random_scene(seed: int, folder: Path) -> dict:
     obstacles = [body() for _ in range(random.integers(0, 4))]
     pull = speed * speed / float(size.max())  # a speed over the box
     smoke = {"buoyancy": pull * 10 ** random.uniform(-2, 2) if chance(0.6) else 0.0}
-    smoke |= {
-        "weight": pull * 10 ** random.uniform(-3, 1) if chance(0.3) else 0.0,
-        "up": random.normal(size=3).tolist(),
-    }
+    smoke["weight"] = pull * 10 ** random.uniform(-3, 1) if chance(0.3) else 0.0
+    smoke["up"] = random.normal(size=3).tolist()
     smoke |= {"scheme": str(pick(["maccormack", "semi-lagrangian"])), "bricks": chance(0.3)}
     smoke |= {"dissipation": rate * 0.3 * chance(0.3), "cooling": rate * 0.3 * chance(0.3)}
     smoke |= {"storage": "float16" if chance(0.3) else "float32", "substeps": int(pick([1, 2, 3, 4, 8]))}

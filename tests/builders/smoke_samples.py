@@ -51,9 +51,8 @@ def small_pool(count: int = 6, first: int = 0, resolution: int = 32, kind: str =
         targets.append(torch.stack([target for _, target in pair]))
     motion = torch.zeros(count, 2, resolution, resolution)
     motion[:, 1] = -1.0
-    return Pool(
-        torch.stack(guides).half(), torch.stack(targets).half(), motion.half(), torch.arange(first, first + count)
-    )
+    numbers = torch.arange(first, first + count)
+    return Pool(torch.stack(guides).half(), torch.stack(targets).half(), motion.half(), numbers)
 
 
 def random_model(spread: float = 0.2, seed: int = 0, **settings: Any) -> SmokeModel:

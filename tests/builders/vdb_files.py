@@ -85,9 +85,8 @@ def tree(
 def scaled(*scale: float) -> bytes:
     """A map of voxels with those edges."""
     edges = np.array(scale)
-    return (
-        _text("ScaleMap") + np.concatenate([edges, edges, 1 / edges, 1 / edges**2, 0.5 / edges]).astype("<f8").tobytes()
-    )
+    numbers = np.concatenate([edges, edges, 1 / edges, 1 / edges**2, 0.5 / edges])
+    return _text("ScaleMap") + numbers.astype("<f8").tobytes()
 
 
 def affine(matrix: np.ndarray) -> bytes:

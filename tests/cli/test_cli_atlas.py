@@ -69,11 +69,10 @@ def test_lightmaps_of_a_material_slot(tmp_path):
     position, triangle, uv = box((0, 0, 0), (1, 1, 1))
     turned = {"KHR_texture_transform": {"rotation": np.pi / 2, "offset": [0.0, 1.0]}}  # (v, 1 - u)
     slots = [{"index": 0}, {"index": 0, "extensions": turned}]
+    right = np.stack([1 - uv[:, 1], 0.5 + uv[:, 0] / 2], 1)
     things = [
         Thing(name, position + 2 * i, triangle, [places], material={"emissiveTexture": slot})
-        for i, (name, slot, places) in enumerate(
-            zip("ab", slots, (uv * [0.5, 1], np.stack([1 - uv[:, 1], 0.5 + uv[:, 0] / 2], 1)), strict=True)
-        )
+        for i, (name, slot, places) in enumerate(zip("ab", slots, (uv * [0.5, 1], right), strict=True))
     ]
     row, column = np.mgrid[:48, :64] / 64
     light = np.stack([0.2 + column, 0.3 + row, 0.5 + 0 * row], 2)
@@ -96,9 +95,7 @@ def test_wrong_words_are_one_line(inputs, tmp_path):
     out = ["-o", tmp_path / "a.wlm"]
     words = ["compress", *inputs, *out]
     assert "--budget: expected greater than 0, got '0'" in fails(*words, "--budget", 0).replace("should be ", "")
-    assert "--colour: expected 'half', 'rgb9e5', 'bc6h', 'astc' or 'mixed', got 'png'" in fails(
-        *words, "--colour", "png"
-    )
+    assert "--colour: expected 'half', 'rgb9e5', 'bc6h', 'astc' or 'mixed', got" in fails(*words, "--colour", "png")
     assert "budget: " in fails(*words, "--profile", "paper", "--budget", 0.1)
     assert "TEXCOORD_3" in fails(*words, "--uv-set", 3)
     assert "cannot read the mask" in fails(*words, "--mask", tmp_path / "a.png")

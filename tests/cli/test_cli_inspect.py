@@ -127,16 +127,7 @@ def kinds() -> dict[str, dict[str, bytes]]:
     """For each kind of file the contents of small ones, by suffix, or by name after a slash."""
     stored = {name: (CORPUS / name).read_bytes() for name in os.listdir(CORPUS)}
     yaml_scene, sheets = json.dumps(SCENE).encode(), json.dumps(SHEETS).encode()
-    light = (
-        "light.exr",
-        "six-way.exr",
-        "plain.hdr",
-        "light.pfm",
-        "strips.tif",
-        "levels.jpg",
-        "mask-grey.png",
-        "bc6h.dds",
-    )
+    light = "light.exr six-way.exr plain.hdr light.pfm strips.tif levels.jpg mask-grey.png bc6h.dds".split()
     return {
         "arrays": {".npz": small_npz(other=np.ones(3))},
         "checkpoint": {".wlm.partial": encode_artifact("probe-checkpoint", {}, {"a": np.ones(3)}, "none")},
@@ -240,9 +231,7 @@ def test_every_command_for_a_folder_works(names, command, tmp_path, monkeypatch)
     monkeypatch.chdir(tmp_path)
     copy(Path(NAME), names)
     found = inspect(Path(NAME))
-    assert [finding.command.startswith(f"wlm {command}") for finding in found if finding.command] == [True] * bool(
-        command
-    )
+    assert [each.command.startswith(f"wlm {command}") for each in found if each.command] == [True] * bool(command)
     for finding in found if command else ():
         run(finding)
 
@@ -308,9 +297,7 @@ def test_the_command(tmp_path):
     path = tmp_path / "a volume.npz"
     np.savez(path, density=np.ones((2, 2, 2), np.float32))
     run = CliRunner().invoke
-    assert run(app, ["inspect", str(path)]).output.startswith(
-        f"{path}: a volume of smoke, 2x2x2 voxels of 1 -> wlm smoke"
-    )
+    assert run(app, ["inspect", str(path)]).output.startswith(f"{path}: a volume of smoke, 2x2x2 voxels of 1 -> wlm")
     (found,) = json.loads(run(app, ["inspect", str(path), "--json"]).output)
     assert found["path"] == str(path) and found["problems"] == []
     assert found["command"] == f"wlm smoke bake '{path}' -o OUT.exr"

@@ -25,11 +25,8 @@ def camera_of(volume) -> Camera:
 def test_pictures_of_all_orders_agree_with_the_path_tracer(volume, tmp_path):
     """All orders are brighter than single scattering and near the path tracer; albedo 0 is black without fire."""
     lamp = ("--light", "1,0.5,0.6:9", "--volume", "extinction=8", "--volume", "emission=0")
-    for name, words in (
-        ("all", ("--albedo", "0.95")),
-        ("single", ("--orders", "single", "--albedo", "0.95")),
-        ("black", ("--albedo", "0")),
-    ):
+    albedo = "--albedo", "0.95"
+    for name, words in (("all", albedo), ("single", ("--orders", "single", *albedo)), ("black", ("--albedo", "0"))):
         call("smoke", "light", volume, "-o", tmp_path / f"{name}.png", *SMALL, *words, *lamp)
     seen = {name: png(tmp_path / f"{name}.png").astype(float) for name in ("all", "single", "black")}
     assert not seen["black"].any()
@@ -57,13 +54,7 @@ def test_frames_keep_their_obstacles_and_lights(tmp_path):
     assert not np.array_equal(*(png(tmp_path / "lit" / f"light_000{n}.png") for n in (1, 2)))
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (("--light", "0,0,0"), "--light"),
-        (("--point", "0,0,0:-1"), "--point"),
-    ],
-)
+@pytest.mark.parametrize("words, message", [(("--light", "0,0,0"), "--light"), (("--point", "0,0,0:-1"), "--point")])
 def test_wrong_options_are_one_line(volume, tmp_path, words, message):
     output = tmp_path / "out.png"
     assert message in fails("smoke", "light", volume, "-o", output, *SMALL, *words)

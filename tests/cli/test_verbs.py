@@ -139,11 +139,8 @@ def test_the_kind_of_an_input_chooses_the_system(tmp_path):
     assert input_system(tmp_path / "smoke.npz") == "smoke"
     assert input_system(tmp_path / "mesh.glb") == "atlas"
     assert input_system(tmp_path) == "lightmap"
-    for name, line in (
-        ("other.npz", "the kind of input is not clear"),
-        ("light_6h.exr", "wlm compress MESH LIGHTMAP"),
-        ("absent", "no such file or folder"),
-    ):
+    said = ("other.npz", "the kind of input is not clear"), ("light_6h.exr", "wlm compress MESH LIGHTMAP")
+    for name, line in (*said, ("absent", "no such file or folder")):
         assert line in fails("compress", tmp_path / name, "-o", tmp_path / "a.wlm")
     assert "already compressed" in fails("compress", FILES / "lightmap.wlm", "-o", tmp_path / "a.wlm")
     assert "use wlm smoke bake" in fails("compress", tmp_path / "smoke.npz", "-o", tmp_path / "a.wlm")

@@ -22,9 +22,7 @@ ROOT = Path(__file__).resolve().parents[2]
 FILES, CORPUS = ROOT / "tests" / "files", ROOT / "tests" / "fuzz" / "corpus"
 
 
-@pytest.mark.parametrize(
-    ("words", "code"), [("--version", 0), pytest.param("info absent.wlm", 2, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("words, code", [("--version", 0), pytest.param("info absent.wlm", 2, marks=pytest.mark.slow)])
 def test_streams_that_are_closed_or_full(words, code):
     """A closed or full stderr changes no exit code; a full stdout is an output that cannot be written."""
     command = subprocess.list2cmdline([sys.executable, "-m", "wlm", *words.split()])

@@ -82,14 +82,8 @@ def test_a_command_whose_package_is_broken_ends_in_one_line(tmp_path):
     before = sorted(os.listdir(folder))
     words = [[str(word) for word in words] for *_, words in COMMANDS]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join((str(packages), str(ROOT)))}
-    child = subprocess.run(
-        [sys.executable, "-c", RUN],
-        input=json.dumps(words),
-        cwd=folder,
-        env=environment,
-        capture_output=True,
-        text=True,
-    )
+    run = {"input": json.dumps(words), "cwd": folder, "env": environment, "capture_output": True, "text": True}
+    child = subprocess.run([sys.executable, "-c", RUN], **run)
     assert child.returncode == 0, child.stderr
     runs = [json.loads(line) for line in child.stdout.splitlines() if line.startswith("[")]
     for (package, fault, command), (code, said, error) in zip(COMMANDS, runs, strict=True):

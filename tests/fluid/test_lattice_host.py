@@ -4,6 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
+from builders.checks import error_of, misuse_of
 
 from wlm.errors import WlmError
 from wlm.fluid.faces import FACES
@@ -36,8 +37,7 @@ def test_not_a_number_is_reported(device: str):
     with pytest.raises(WlmError, match=r"blew up in step 5 at cell \(\d+, \d+, \d+\): not a number") as caught:
         box.step(CHECK_EVERY)
     assert "\n" not in str(caught.value)
-    with pytest.raises(WlmError, match="step 5 "):
-        box.check()
+    assert "step 5 " in error_of(box.check)
 
 
 def test_speed_and_density_are_reported(device: str):
@@ -52,8 +52,7 @@ def test_speed_and_density_are_reported(device: str):
     box = Lattice(SHAPE, viscosity=0.02, device=device)
     box.set_flow(density=-0.1)
     box.step()
-    with pytest.raises(WlmError, match=r"step 0 at cell \(0, 0, 0\): the density is not positive"):
-        box.step(CHECK_EVERY - 1)
+    assert "step 0 at cell (0, 0, 0): the density is not positive" in error_of(box.step, CHECK_EVERY - 1)
 
 
 def test_blow_up_stops_the_run_soon(device: str):
@@ -100,8 +99,7 @@ def test_too_fast(device: str):
         lambda: box.set_inlet("-x", (0.31, 0.0, 0.0)),
         lambda: box.set_solid(np.indices(SHAPE)[0] < 4, (0.0, 0.4, 0.0)),
     ):
-        with pytest.raises(WlmError, match=f"at most {MAX_SPEED}"):
-            wrong()
+        assert f"at most {MAX_SPEED}" in error_of(wrong)
 
 
 def test_too_large_for_the_memory(device: str, monkeypatch: pytest.MonkeyPatch):
@@ -109,19 +107,16 @@ def test_too_large_for_the_memory(device: str, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("wlm.fluid.slabs.free_memory", lambda _device: 3 * 2**29)
     with pytest.raises(WlmError, match=r"256 x 256 x 256 cells need 2\.4 GiB on .*: expected at most the 1\.5 GiB"):
         Lattice((256, 256, 256), viscosity=0.02, device=device)
-    with pytest.raises(WlmError, match="fewer than 2"):
-        Lattice((2048, 1024, 1024), viscosity=0.02, device=device)
+    assert "fewer than 2" in error_of(Lattice, (2048, 1024, 1024), viscosity=0.02, device=device)
 
 
 def test_calls_out_of_order(device: str):
     box = Lattice(SHAPE, viscosity=0.02, device=device)
     box.set_wall("-x")
-    with pytest.raises(ValueError, match=r"'\+x': expected a wall"):
-        box.step()
+    assert "'+x': expected a wall" in misuse_of(box.step)
     box.set_wall("+x")
     box.step()
-    with pytest.raises(ValueError, match="before set_flow"):
-        box.set_wall("-y")
+    assert "before set_flow" in misuse_of(box.set_wall, "-y")
 
 
 def test_a_state_goes_on_to_the_last_bit(device: str):
@@ -347,18 +342,13 @@ def _ring(inner: float, outer: float, centre, sides: int = 96) -> Mesh:
     angle = np.arange(sides) * (2 * np.pi / sides)
     section = ((inner, -1), (outer, -1), (outer, 1), (inner, 1))
     corners = [(r * np.cos(a), r * np.sin(a), z) for a in angle for r, z in section]
-    quads = [
-        (4 * k + a, 4 * ((k + 1) % sides) + a, 4 * ((k + 1) % sides) + b, 4 * k + b)
-        for k in range(sides)
-        for a, b in ((0, 1), (1, 2), (2, 3), (3, 0))
-    ]
+    sides_of = ((k, (k + 1) % sides, a, (a + 1) % 4) for k in range(sides) for a in range(4))
+    quads = [(4 * k + a, 4 * after + a, 4 * after + b, 4 * k + b) for k, after, a, b in sides_of]
     triangles = [t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))]
     return Mesh(Trajectory.of(centre), np.array(corners, np.float32), np.array(triangles))
 
 
-@pytest.mark.parametrize(
-    ("radius", "storage", "most"), [(8, "float32", 0.03), (8, "float16", 0.03), (16, "float32", 0.012)]
-)
+@pytest.mark.parametrize("radius, storage, most", [(8, "float32", 0.03), (8, "float16", 0.03), (16, "float32", 0.012)])
 def test_a_cylinder_turns_in_another(radius: int, storage: str, most: float, device: str):
     """Taylor and Couette between a turning cylinder and one at rest of twice the radius: the exact profile of the
     tangential velocity, as the RMS error over the speed of the wall."""

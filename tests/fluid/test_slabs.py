@@ -5,8 +5,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import warp as wp
+from builders.checks import error_of
 
-from wlm.errors import WlmError
 from wlm.fluid.faces import FACES
 from wlm.fluid.forcing import Fire, Turbulence, Wind
 from wlm.fluid.lattice import Lattice
@@ -109,9 +109,7 @@ def test_outlets_of_all_slabs_conserve_mass(storage: str, device: str):
     one, several = (_tunnel(names, outlet=None, storage=storage) for names in (device, [device] * 3))
     for lattice in (one, several):
         lattice.step(60)
-    fields = [
-        np.dstack([lattice.density(), lattice.velocity().numpy().reshape(*SHAPE[:2], -1)]) for lattice in (one, several)
-    ]
+    fields = [np.dstack([each.density(), each.velocity().numpy().reshape(*SHAPE[:2], -1)]) for each in (one, several)]
     np.testing.assert_allclose(*fields, atol=1e-6 if storage == "float32" else 2e-4)
     assert abs(several.mass() / np.prod(SHAPE) - 1.0) < (1e-6 if storage == "float32" else 1e-3)
 
@@ -122,8 +120,7 @@ def test_a_blow_up_names_the_cell_of_the_box(device: str):
     velocity[9, 4, 3] = 0.9
     several.set_flow(velocity)
     several.step(1)
-    with pytest.raises(WlmError, match=r"step 0 at cell \(9, 4, 3\)"):
-        several.check()
+    assert "step 0 at cell (9, 4, 3)" in error_of(several.check)
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)
@@ -161,10 +158,8 @@ def test_smoke_is_that_of_one_device(scheme: str, storage: str, device: str, tmp
 
 
 def test_what_is_refused(device: str):
-    for names, message in (
-        ([device] * 12, "device: expected 1 to 11, the number of cells along x, got 12 devices"),
-        ([], "got 0 devices"),
-    ):
+    wrong = [device] * 12, "device: expected 1 to 11, the number of cells along x, got 12 devices"
+    for names, message in (wrong, ([], "got 0 devices")):
         with pytest.raises(ValueError, match=message):
             Lattice(SHAPE, viscosity=0.1, device=names)
     with pytest.raises(ValueError, match="bricks: expected none on several devices"):

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from builders.checks import error_of
 from builders.nvdb_files import LEVEL_SET, nvdb_file, raw_grid
 from builders.vdb_files import ACTIVE_MASK, scaled, tree, vdb_file
 
@@ -108,10 +109,7 @@ def test_nanovdb_that_claims_too_much(tmp_path: Path):
         (old, "expected version 32 of NanoVDB's grids, found 28"),
         (nvdb_file(bomb * 50, codec=1, size=len(whole)), "after decompression, found "),
         (nvdb_file(whole, codec=9), "expected a codec from 0 to 2, found 9"),
-        (
-            raw_grid(smoke(), "float")[:632] + struct.pack("<2I", 2, 6) + whole[640:],
-            r"found density \(vec3f\): coloured smoke",
-        ),
+        (raw_grid(smoke(), "float")[:632] + struct.pack("<2I", 2, 6) + whole[640:], r"density \(vec3f\): coloured"),
     ):
         path.write_bytes(bytes(data))
         with pytest.raises(WlmError, match=rf"a\.nvdb: .*{message}"):
@@ -125,8 +123,7 @@ def test_tiles_that_overlap(tmp_path: Path):
         tiles = [struct.pack("<3if?", 4096 + i * shift, 0, 0, 0.5, False) for i in range(2)]
         moved = nodes[:8] + struct.pack("<I", 2) + nodes[12:16] + b"".join(tiles) + nodes[16:]
         (tmp_path / "a.vdb").write_bytes(vdb_file({"density": (head, moved, ACTIVE_MASK, False)}))
-        with pytest.raises(WlmError, match="expected root nodes at different multiples of 4096"):
-            load_volume(tmp_path / "a.vdb")
+        assert "expected root nodes at different multiples of 4096" in error_of(load_volume, tmp_path / "a.vdb")
 
 
 @pytest.mark.parametrize(
@@ -160,16 +157,13 @@ def test_the_grid_of_the_smoke(heads: str, chosen: str | None):
         group = kind.replace("_", " ") if kind == "level_set" else ""
         found.append(GridHead(name, "float" if group or not kind else kind, group))
     if chosen is None:
-        reason = ".*coloured smoke is not read" if "vec3s" in heads else ""
-        with pytest.raises(
-            WlmError, match=f"a: expected a grid of floats named density, found {found[0].name}{reason}"
-        ):
-            choose("a", found)
+        said = error_of(choose, "a", found)
+        assert f"a: expected a grid of floats named density, found {found[0].name}" in said
+        assert ("coloured smoke is not read" in said) == ("vec3s" in heads)
         return
     density, _, warnings = choose("a", found)
-    coloured = [
-        f"a: colours ({name}) are not read: smoke has one albedo" for name in ("color", "scatter") if name in heads
-    ]
+    coloured = [name for name in ("color", "scatter") if name in heads]
+    coloured = [f"a: colours ({name}) are not read: smoke has one albedo" for name in coloured]
     named = [f"a: the grid {chosen} is read as the density"] * (chosen.lower() != "density")
     assert density == chosen and len(warnings) == len(named + coloured)
     assert all(each.startswith(text) for each, text in zip(warnings, named + coloured, strict=True))
@@ -186,8 +180,7 @@ def test_level_sets(tmp_path: Path):
             path.write_bytes(data)
         else:
             path.write_bytes(vdb_file({"density" + "|level set|float" * (name == "a"): grid(ball, 3.0)}))
-        with pytest.raises(WlmError, match="level set"):
-            load_volume(path)
+        assert "level set" in error_of(load_volume, path)
         filled = load_volume(path, density="density")
         assert len(filled.warnings) == 1 and "filled with smoke of density 1" in filled.warnings[0]
         np.testing.assert_allclose(filled.density, np.clip(-ball / 3, 0, 1), atol=1e-6)
@@ -210,16 +203,12 @@ def test_temperatures_in_kelvin(tmp_path: Path):
     light = black_body_luminance(heat) / black_body_luminance(1500.0)
     np.testing.assert_allclose(volume.temperature, light, rtol=1e-5)
     emitted = 2 * light.max()
-    assert (
-        volume.kelvin and f"are read as kelvins: the hottest voxel emits {emitted:.2g} per length" in volume.warnings[0]
-    )
+    assert volume.kelvin and f"as kelvins: the hottest voxel emits {emitted:.2g} per length" in volume.warnings[0]
     np.testing.assert_array_equal(load_volume(path, up="y", kelvin=True).temperature, volume.temperature)
     raw = load_volume(path, up="y", kelvin=False)
     np.testing.assert_array_equal(raw.temperature, heat)
     assert raw.warnings == () and not raw.kelvin
-    with pytest.raises(
-        WlmError, match=r"b\.nvdb: temperature: expected kelvins, found their light: load .* kelvin=False"
-    ):
+    with pytest.raises(WlmError, match=r"b\.nvdb: temperature: expected kelvins, found their light: load .* kelvin="):
         save_volume(tmp_path / "b.nvdb", volume)
     save_volume(tmp_path / "b.nvdb", raw)
     np.testing.assert_array_equal(load_volume(tmp_path / "b.nvdb", up="y", kelvin=False).temperature, heat)
@@ -239,9 +228,8 @@ def test_black_bodies():
     for kelvin in (300.0, 900.0, 3000.0, 20000.0):
         radiance = 2 * 5.9552149e-17 / wavelengths**5 / np.expm1(0.014387769 / (wavelengths * kelvin))
         expected = 683 * np.trapezoid(radiance * seen, wavelengths)
-        assert black_body_luminance(np.array([[kelvin]]))[0, 0] == pytest.approx(
-            expected, rel=0.05 if kelvin > 500 else 0.5
-        )
+        close = 0.05 if kelvin > 500 else 0.5
+        assert black_body_luminance(np.array([[kelvin]]))[0, 0] == pytest.approx(expected, rel=close)
     assert black_body_luminance(np.array([-1.0, 0.0, 100.0])).tolist() == [0.0, 0.0, 0.0]
 
 
@@ -282,23 +270,16 @@ def test_one_grid_for_a_sequence(tmp_path: Path):
     write(tmp_path / "s_0001.vdb", "flame")
     write(tmp_path / "s_0002.vdb", "flame", "density", "temperature")
     frames = load_frames(tmp_path, up="y")
-    assert frames.warnings == (
-        f"{tmp_path}: 1 of 2 frames have no grid density and thus no smoke, the first is s_0001.vdb",
-    )
+    assert frames.warnings[0].startswith(f"{tmp_path}: 1 of 2 frames have no grid density and thus no smoke, the first")
     assert not frames.load(1).density.any() and frames.load(2).density.any() and frames.load(2).temperature is not None
     (finding,) = inspect(tmp_path)
-    assert (
-        finding.what.startswith("2 frames of smoke")
-        and finding.command == f"wlm smoke bake {tmp_path} --volume up=z -o DIR"
-    )
+    assert finding.what.startswith("2 frames of smoke")
+    assert finding.command == f"wlm smoke bake {tmp_path} --volume up=z -o DIR"
     assert input_system(tmp_path) == "smoke"
     write(tmp_path / "s_0001.vdb", "smoke")
     assert not load_frames(tmp_path, up="y").load(1).density.any()
     assert load_frames(tmp_path, up="y", density="smoke").load(1).density.any()
-    with pytest.raises(
-        WlmError, match="fog: expected the name of one of the file's grids of floats, found smoke, flame, density"
-    ):
-        load_frames(tmp_path, density="fog")
+    assert "fog: expected the name of one of" in error_of(load_frames, tmp_path, density="fog")
 
 
 @pytest.mark.parametrize(
@@ -322,8 +303,7 @@ def test_names_of_frames(tmp_path: Path, names: list[str], numbers: tuple[int, .
     for name in names:
         write(tmp_path / f"{name}.vdb", "density", values=smoke((8, 8, 8)))
     if numbers is None:
-        with pytest.raises(WlmError, match="expected frames of simulate, or one sequence of volumes"):
-            load_frames(tmp_path)
+        assert "expected frames of simulate, or one sequence of volumes" in error_of(load_frames, tmp_path)
         return
     frames = load_frames(tmp_path)
     assert frames.numbers == numbers

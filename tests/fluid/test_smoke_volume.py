@@ -2,6 +2,7 @@
 
 import gzip
 import itertools
+import re
 import struct
 import sys
 from pathlib import Path
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
+from builders.checks import error_of
 from builders.nvdb_files import nvdb_file, raw_grid
 from builders.vdb_files import ACTIVE_MASK, BLOSC, ZIP, affine, scaled, tree, vdb_file
 
@@ -58,19 +60,17 @@ def test_bricks(tmp_path: Path, device: str):
         ("bricks", [3, 3], "bricks: expected rising int32"),
         ("bricks", [3, 12], "bricks: expected numbers from 0 to 11"),
         ("bricks", [-1, 3], "bricks: expected numbers from 0 to 11"),
-        ("bricks", [3, 4, 5], r"density_bricks: expected floats \[3, 8, 8, 8\]"),
+        ("bricks", [3, 4, 5], "density_bricks: expected floats [3, 8, 8, 8]"),
         ("shape", [13, 0, 9], "shape: expected 3 whole numbers from 1"),
         ("shape", [1024, 1024, 1024], "shape: expected at most 256 times its"),
         ("shape", [4096, 4096, 4096], "shape: expected at most 1073741824 voxels"),
     ):
         kind = parts[name].dtype
         np.savez(tmp_path / "b.npz", **parts | {name: np.array(value, kind)})
-        with pytest.raises(WlmError, match=f"b.npz: {message}"):
-            load_volume(tmp_path / "b.npz")
+        assert f"b.npz: {message}" in error_of(load_volume, tmp_path / "b.npz")
     del parts["density_bricks"]
     np.savez(tmp_path / "b.npz", **parts)
-    with pytest.raises(WlmError, match="b.npz: density is missing; found voxel, origin, temperature"):
-        load_volume(tmp_path / "b.npz")
+    assert "b.npz: density is missing; found voxel, origin, temperature" in error_of(load_volume, tmp_path / "b.npz")
 
 
 def test_types():
@@ -141,9 +141,7 @@ def test_nvdb_of_two_grids(tmp_path: Path):
     by_name = load_volume(tmp_path / "both.nvdb", density="temperature")
     np.testing.assert_array_equal(by_name.density, hot)
     assert by_name.temperature is None
-    with pytest.raises(
-        WlmError, match="both.nvdb: heat: expected the name of one of .* floats, found temperature .*, density"
-    ):
+    with pytest.raises(WlmError, match="both.nvdb: heat: expected the name of one of .* floats, found temperature"):
         load_volume(tmp_path / "both.nvdb", temperature="heat")
     # Each in a segment of its own, as converters append them; and the temperature in finer voxels, further on.
     finer = raw_grid(np.ones_like(hot), name="temperature", voxel=0.25, origin=(2.875, 2, 3))
@@ -167,8 +165,7 @@ def test_wrong_nvdb(tmp_path: Path):
         (raw_grid(np.ones((8, 8, 8)), voxel=0.0), "expected an invertible transform to the world"),
     ):
         path.write_bytes(content)
-        with pytest.raises(WlmError, match=rf"a\.nvdb: .*{message}"):
-            load_volume(path)
+        assert re.search(rf"a\.nvdb: .*{message}", error_of(load_volume, path))
 
 
 @pytest.mark.parametrize(
@@ -182,8 +179,7 @@ def test_wrong_nvdb(tmp_path: Path):
 )
 def test_wrong_npz(tmp_path: Path, arrays: dict, message: str):
     np.savez(tmp_path / "a.npz", **arrays)
-    with pytest.raises(WlmError, match=rf"a\.npz: {message}"):
-        load_volume(tmp_path / "a.npz")
+    assert re.search(rf"a\.npz: {message}", error_of(load_volume, tmp_path / "a.npz"))
 
 
 def test_wrong_files(tmp_path: Path):
@@ -196,8 +192,7 @@ def test_wrong_files(tmp_path: Path):
         ("b.npz", "cannot read the arrays"),
         ("c.npz", "expected a .npz file, which names its arrays"),
     ):
-        with pytest.raises(WlmError, match=message):
-            load_volume(tmp_path / name)
+        assert re.search(message, error_of(load_volume, tmp_path / name))
 
 
 def test_emission_beyond_what_pictures_hold_is_lowered(device: str):
@@ -334,8 +329,7 @@ def test_a_folder_of_another_programs_frames(tmp_path: Path):
     views = [frames.view(frames.camera, frames.load(number)) for number in frames.numbers]
     assert views[0] == views[1] == views[2] and views[0].position[:2] == (7.0, 7.0)
     (tmp_path / "fire_0001.vdb").write_bytes(b"")
-    with pytest.raises(WlmError, match=r"one sequence of volumes.*found fire_\*\.vdb, smoke_v2\.\*\.vdb"):
-        load_frames(tmp_path)
+    assert re.search(r"one sequence of volumes.*found fire_\*\.vdb, smoke_v2\.\*\.vdb", error_of(load_frames, tmp_path))
 
 
 def test_damage(tmp_path: Path):
@@ -344,30 +338,20 @@ def test_damage(tmp_path: Path):
     whole = path.read_bytes()
     for size in (0, 10, 45, 100, 300, 5000, len(whole) // 2, len(whole) - 1):
         path.write_bytes(whole[:size])
-        with pytest.raises(WlmError, match=r"a\.vdb: (density: )?(cannot read the OpenVDB file|expected)"):
-            load_volume(path)
+        assert re.search(r"a\.vdb: (density: )?(cannot read the OpenVDB file|expected)", error_of(load_volume, path))
     path.write_bytes(whole[:8] + struct.pack("<I", 221) + whole[12:])
-    with pytest.raises(WlmError, match="expected version 222 to 224 of OpenVDB's files, found 221"):
-        load_volume(path)
+    assert "expected version 222 to 224 of OpenVDB's files, found 221" in error_of(load_volume, path)
     path.write_bytes(whole.replace(b"ScaleMap", b"OtherMap"))
-    with pytest.raises(WlmError, match="a.vdb: density: expected a linear transform, found a OtherMap"):
-        load_volume(path)
+    assert "a.vdb: density: expected a linear transform, found a OtherMap" in error_of(load_volume, path)
     path.write_bytes(whole.replace(b"Tree_float_5_4_3", b"Tree_vec3s_5_4_3"))
-    with pytest.raises(
-        WlmError, match=r"a.vdb: expected a grid of floats named density, found density \(vec3s\): coloured smoke"
-    ):
-        load_volume(path)
+    assert "a.vdb: expected a grid of floats named density, found density (vec3s): col" in error_of(load_volume, path)
     nodes = tree(*smoke(), 0)
     both = vdb_file({name: (scaled(1, 1, 1), nodes, 0, False) for name in ("density", "heat")})
     path.write_bytes(both.replace(b"Tree_float_5_4_3", b"Tree_vec3s_5_4_3", 1))
-    with pytest.raises(
-        WlmError, match=r"a.vdb: expected a grid of floats named density, found density \(vec3s\), heat: coloured"
-    ):
-        load_volume(path)
+    assert "a grid of floats named density, found density (vec3s), heat: coloured" in error_of(load_volume, path)
     assert load_volume(path, density="heat").shape == (24, 16, 32)
     write(path, placed=scaled(1, 1, 1e-7))
-    with pytest.raises(WlmError, match="a.vdb: density: expected at most 16777216 cubic voxels"):
-        load_volume(path)
+    assert "a.vdb: density: expected at most 16777216 cubic voxels" in error_of(load_volume, path)
 
 
 def test_blosc_without_its_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

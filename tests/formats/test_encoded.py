@@ -48,16 +48,12 @@ def test_what_no_encoding_says(tmp_path):
     path = tmp_path / "a.png"
     Image.fromarray(BYTES[..., :3]).save(path)
     assert read_encoded(path, "srgb").shape == (1, 2, 3)
-    assert "encoding rgbm: expected a picture with alpha, found the channels RGB" in error_of(
-        read_encoded, path, "rgbm"
-    )
+    assert "rgbm: expected a picture with alpha, found the channels RGB" in error_of(read_encoded, path, "rgbm")
     for wrong in ("logluv", "rgbm:0", "rgbm:x", "rgbm:8:2:1", "srgb:2", "rgbm:nan", "layer:", ""):
         assert "encoding: expected linear, srgb, rgbm, rgbm:RANGE:GAMMA" in error_of(read_encoded, path, wrong)
     assert "found a PNG: state what light its numbers stand for with --encoding" in error_of(read_light, path)
     write_exr(tmp_path / "a.exr", np.ones((2, 2, 3)))
-    assert "encoding: expected a PNG, JPEG, WebP, TGA or TIFF of integers" in error_of(
-        read_encoded, tmp_path / "a.exr", "srgb"
-    )
+    assert "expected a PNG, JPEG, WebP, TGA or TIFF of integers" in error_of(read_encoded, tmp_path / "a.exr", "srgb")
 
 
 def _picture(path, image, **options):
@@ -73,11 +69,7 @@ def _read(path, encoding="linear"):
 def test_grey_and_palettes(tmp_path):
     levels = np.array([[0, 51, 255]], np.uint8)
     path, expected = tmp_path / "a.png", np.repeat(levels[..., None] / np.float32(255), 3, 2)
-    for image in (
-        Image.fromarray(levels),
-        Image.fromarray(np.stack([levels, levels], -1)),
-        Image.fromarray(levels > 99),
-    ):
+    for image in map(Image.fromarray, (levels, np.stack([levels, levels], -1), levels > 99)):
         light, notes = _read(_picture(path, image))
         wanted = expected if image.mode != "1" else np.round(expected)
         np.testing.assert_allclose(light, wanted, rtol=1e-6)
@@ -143,9 +135,7 @@ def test_levels_that_are_no_light_are_refused(tmp_path):
     path = _picture(tmp_path / "a.webp", frames[0], save_all=True, append_images=frames[1:])
     assert "expected one picture, found an animation of 2" in error_of(read_encoded, path, "srgb")
     path = _picture(tmp_path / "a.jpg", Image.new("CMYK", (4, 4)))
-    assert "expected a JPEG of grey, RGB or a palette, with alpha or without, found mode CMYK" in error_of(
-        read_encoded, path, "srgb"
-    )
+    assert "of grey, RGB or a palette, with alpha or without, found mode CMYK" in error_of(read_encoded, path, "srgb")
     for suffix, form in ((".png", "PNG"), (".jpg", "JPEG"), (".webp", "WEBP"), (".tga", "TGA")):
         data = io.BytesIO()
         Image.new("RGB", (64, 64)).save(data, form)

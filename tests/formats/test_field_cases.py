@@ -10,12 +10,12 @@ import imagecodecs
 import numpy as np
 import OpenEXR
 import pytest
+from builders.checks import error_of
 from builders.exr import exr_header
 from builders.textures import make_ktx2
 from PIL import Image
 
 import wlm
-from wlm.errors import WlmError
 from wlm.formats.channels import read_encoded
 from wlm.formats.light import read_light
 from wlm.formats.meshes import read_mesh
@@ -61,8 +61,7 @@ def test_an_obj_of_another_writer(tmp_path, text, heights):
 )
 def test_an_obj_that_names_vertices_that_are_not_there(tmp_path, face, reason):
     (tmp_path / "a.obj").write_text(ONE + face)
-    with pytest.raises(WlmError, match=reason):
-        read_mesh(tmp_path / "a.obj")
+    assert re.search(reason, error_of(read_mesh, tmp_path / "a.obj"))
 
 
 def png(*chunks: tuple[bytes, bytes]) -> bytes:
@@ -87,9 +86,8 @@ def test_a_png_that_states_another_encoding(tmp_path, chunks, encoding, stated):
     light = read_encoded(tmp_path / "a.png", encoding, notes)
     assert light[0, 0, 0] == pytest.approx(0.5 if encoding == "linear" else 0.214, abs=1e-3)
     said = [line for line in notes if "the PNG says" in line]
-    assert said == (
-        [f"the PNG says that its levels are {stated}: is its encoding {stated}, not {encoding}?"] * bool(stated)
-    )
+    asked = f"the PNG says that its levels are {stated}: is its encoding {stated}, not {encoding}?"
+    assert said == [asked] * bool(stated)
 
 
 @pytest.mark.parametrize(
@@ -102,8 +100,7 @@ def test_a_png_that_states_another_encoding(tmp_path, chunks, encoding, stated):
 )
 def test_light_that_is_none_is_named(tmp_path, content, reason):
     (tmp_path / "a.ktx2").write_bytes(content)
-    with pytest.raises(WlmError, match=reason):
-        read_light(tmp_path / "a.ktx2")
+    assert re.search(reason, error_of(read_light, tmp_path / "a.ktx2"))
 
 
 def test_an_environment_map_is_doubted(tmp_path):
@@ -117,8 +114,7 @@ def test_an_environment_map_is_doubted(tmp_path):
 
 def test_a_table_in_utf_16_is_named(tmp_path):
     (tmp_path / "a.csv").write_text("x,y,z,sh0,sh1,sh2\n0,0,0,1,1,1\n", "utf-16")
-    with pytest.raises(WlmError, match="expected a table in UTF-8, found UTF-16"):
-        wlm.probe.load(tmp_path / "a.csv")
+    assert "expected a table in UTF-8, found UTF-16" in error_of(wlm.probe.load, tmp_path / "a.csv")
 
 
 def test_directions_beside_light_are_not_times_of_it(tmp_path):
@@ -134,8 +130,7 @@ def test_subsampled_channels_are_refused(tmp_path):
     rows = [struct.pack("<2i", y, 16 * (y % 2 == 0)) + np.ones(4 * (y % 2 == 0), "<f4").tobytes() for y in range(8)]
     starts = np.cumsum([len(head) + 64, *map(len, rows[:-1])]).astype("<u8")
     (tmp_path / "a.exr").write_bytes(head + starts.tobytes() + b"".join(rows))
-    with pytest.raises(WlmError, match="channel Y: expected 8x8 pixels in the data window, found 4x4"):
-        read_light(tmp_path / "a.exr")
+    assert "channel Y: expected 8x8 pixels in the data window, found 4x4" in error_of(read_light, tmp_path / "a.exr")
 
 
 LIGHT = np.array([[[0.25, 0.5, 1.0], [2.0, 0.125, 0.0]], [[4.0, 3.0, 0.75], [1.5, 8.0, 0.0625]]], np.float32)

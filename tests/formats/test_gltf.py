@@ -26,12 +26,8 @@ class Maker(GltfMaker):
         super().__init__()
         attributes = {"POSITION": self.add(POINTS, min=[0, 0, 0], max=[9, 9, 9]), "TEXCOORD_0": self.add(PLACES)}
         self.primitive = {"attributes": attributes, "indices": self.add(TRIANGLES.reshape(-1).astype(index_type))}
-        self.content |= {
-            "scene": 0,
-            "scenes": [{"nodes": [0]}],
-            "nodes": [{"mesh": 0}],
-            "meshes": [{"primitives": [self.primitive]}],
-        }
+        self.content |= {"scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}]}
+        self.content["meshes"] = [{"primitives": [self.primitive]}]
 
 
 def _read(maker: Maker, path: Path) -> list[GltfPrimitive]:
@@ -70,19 +66,14 @@ def test_buffers_outside_of_the_file(tmp_path, where):
 
 def test_nested_and_mirrored_nodes(tmp_path):
     maker = Maker()
-    quaternion = Rotation.from_euler("xyz", [0.3, -1.1, 2.0])
+    turn = Rotation.from_euler("xyz", [0.3, -1.1, 2.0])
     upper = np.array([[0, 2, 0, 5], [1, 0, 0, -6], [0, 0, -3, 7], [0, 0, 0, 1.0]])
     maker.content["nodes"] = [
         {"matrix": upper.T.ravel().tolist(), "children": [1]},
-        {
-            "translation": [1, 2, 3],
-            "rotation": (1.0001 * quaternion.as_quat()).tolist(),
-            "scale": [1, -2, 0.5],
-            "mesh": 0,
-        },
+        {"translation": [1, 2, 3], "rotation": (1.0001 * turn.as_quat()).tolist(), "scale": [1, -2, 0.5], "mesh": 0},
     ]
     (found,) = _read(maker, tmp_path)
-    local = quaternion.apply(POINTS[:4] * [1, -2, 0.5]) + [1, 2, 3]
+    local = turn.apply(POINTS[:4] * [1, -2, 0.5]) + [1, 2, 3]
     np.testing.assert_allclose(found.position, local @ upper[:3, :3].T + upper[:3, 3], atol=1e-12)
     # The node mirrors, which turns the winding.
     assert found.mirrored
@@ -103,9 +94,10 @@ def test_a_scene_draws_its_own_nodes_only(tmp_path):
     assert _read(maker, tmp_path) == []
 
 
-@pytest.mark.parametrize(
-    ("name", "scale"), [("uint8", 255), ("uint16", 65535), ("int8", 127), ("int16", 32767), ("uint16", None)]
-)
+SCALES = [("uint8", 255), ("uint16", 65535), ("int8", 127), ("int16", 32767), ("uint16", None)]
+
+
+@pytest.mark.parametrize("name, scale", SCALES)
 def test_integer_uvs(tmp_path, name, scale):
     maker = Maker()
     info = np.iinfo(name)

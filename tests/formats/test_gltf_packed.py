@@ -35,11 +35,8 @@ def meshopt_scene():
     uvs = np.round(UV * 65535).astype("<u2")
     corners = TRIANGLE.astype("<u2").reshape(-1)
     accessors, start = [], 0
-    for data, mode, kind in (
-        (places, "ATTRIBUTES", "VEC3"),
-        (uvs, "ATTRIBUTES", "VEC2"),
-        (corners, "TRIANGLES", "SCALAR"),
-    ):
+    parts = (places, "ATTRIBUTES", "VEC3"), (uvs, "ATTRIBUTES", "VEC2"), (corners, "TRIANGLES", "SCALAR")
+    for data, mode, kind in parts:
         packed = meshopt.encode_gltf_buffer(data, mode)
         view = maker.content["bufferViews"][maker.view(packed)]
         stride = data.nbytes // len(data)
@@ -74,10 +71,8 @@ def draco_file(folder, cut=0, **changes):
         {"componentType": 5123, "count": TRIANGLE.size, "type": "SCALAR"},
     ]
     maker.content["accessors"][0] |= changes
-    packed = {
-        "bufferView": maker.view(data[: len(data) - cut]),
-        "attributes": {name: ids[kinds[name]] for name in kinds},
-    }
+    attributes = {name: ids[kinds[name]] for name in kinds}
+    packed = {"bufferView": maker.view(data[: len(data) - cut]), "attributes": attributes}
     primitive = {"attributes": {"POSITION": 0, "TEXCOORD_0": 1}, "indices": 2, "extensions": {DRACO: packed}}
     return scene(maker, primitive, DRACO).save(folder / "a.glb")
 

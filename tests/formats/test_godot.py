@@ -56,10 +56,8 @@ def test_who_reads_which_part_of_the_lightmap(tmp_path, order, double):
     ]
     scene = read_listing(path)
     assert [each.files for each in scene.sheets] == [["bake.exr"]]
-    assert [(each.node, each.scale_offset) for each in scene.objects] == [
-        ("Wall", [0.125, 0.375, 0.5, 0.25]),
-        ("Floor", [0.5, 0.25, 0.0, 0.0]),
-    ]
+    placed = {each.node: each.scale_offset for each in scene.objects}
+    assert placed == {"Wall": [0.125, 0.375, 0.5, 0.25], "Floor": [0.5, 0.25, 0.0, 0.0]}
     write_exr(tmp_path / "bake.exr", np.ones((8, 8, 3), np.float32))
     (found,) = inspect(tmp_path)
     assert "2 meshes with rectangles in bake.exr" in found.what and not found.problems
@@ -76,11 +74,8 @@ def test_who_reads_which_part_of_the_lightmap(tmp_path, order, double):
 def test_one_probe_and_keys_that_are_string_names_or_no_text(tmp_path):
     writer = Writer()
     points, sh = probes(1)
-    entries = [
-        writer.u32(3, 1) + writer.u32(1),
-        writer.string("sh", 44) + writer.colours(colours(sh)),
-        writer.string("points", 44) + writer.vectors(points),
-    ]
+    entries = [writer.u32(3, 1) + writer.u32(1), writer.string("sh", 44) + writer.colours(colours(sh))]
+    entries.append(writer.string("points", 44) + writer.vectors(points))
     data = writer.u32(26, len(entries)) + b"".join(entries)
     (tmp_path / "a.lmbake").write_bytes(writer.file([("probe_data", data)]))
     position, found = read_lmbake(tmp_path / "a.lmbake")
@@ -151,9 +146,7 @@ def test_bakes_without_probes_or_with_too_few_colours(tmp_path):
     none = "probe_data has no probes: bake with LightmapProbe nodes"
     assert none in message(tmp_path, writer.file([("x", writer.u32(1))]))
     assert none in message(tmp_path, writer.file(bake(writer, points[:0], sh[:0])))
-    assert "expected 9 colours for each of 5 points, found 36" in message(
-        tmp_path, writer.file(bake(writer, points, sh[:4]))
-    )
+    assert "9 colours for each of 5 points, found 36" in message(tmp_path, writer.file(bake(writer, points, sh[:4])))
     assert "probe_data: expected a dictionary" in message(tmp_path, writer.file([("probe_data", writer.u32(1))]))
 
 
@@ -192,15 +185,11 @@ def test_other_damage_has_its_own_line(tmp_path):
     assert "expected a reference of kind 0 to 3, found 4" in message(tmp_path, writer.file([("x", writer.u32(24, 4))]))
     data = writer.file([("x", writer.u32(3, 1234))])
     at = data.index(writer.u32(3, 1234)) - 4
-    assert "expected an index of a name below 3, found 3" in message(
-        tmp_path, data[:at] + writer.u32(3) + data[at + 4 :]
-    )
+    assert "an index of a name below 3, found 3" in message(tmp_path, data[:at] + writer.u32(3) + data[at + 4 :])
     table = data.index(b"local://0\0") + len(b"local://0\0")
     assert "cut short or damaged" in message(tmp_path, data[:table] + b"\xff" * 8 + data[table + 8 :])
     at = data.index(writer.u32(1) + writer.text("local://0"))
-    assert "contains no resource: expected at least one" in message(
-        tmp_path, data[:at] + writer.u32(0) + data[at + 4 :]
-    )
+    assert "no resource: expected at least one" in message(tmp_path, data[:at] + writer.u32(0) + data[at + 4 :])
 
 
 def test_a_long_name_counts_at_each_use(tmp_path):

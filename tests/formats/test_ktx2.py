@@ -39,17 +39,8 @@ def test_the_header(tmp_path, fmt):
     data = path.read_bytes()
     assert data[:12] == bytes([0xAB, 0x4B, 0x54, 0x58, 0x20, 0x32, 0x30, 0xBB, 0x0D, 0x0A, 0x1A, 0x0A])
     found = [_word(data, at) for at in (FORMAT, TYPE_SIZE, WIDTH, HEIGHT, DEPTH, LAYERS, FACES, LEVELS, SCHEME)]
-    assert found == [
-        VK_FORMATS[fmt],
-        (4 if fmt.startswith(("E", "R32")) else 2) if fmt in TEXEL else 1,
-        5,
-        3,
-        0,
-        0,
-        1,
-        1,
-        0,
-    ]
+    word = (4 if fmt.startswith(("E", "R32")) else 2) if fmt in TEXEL else 1
+    assert found == [VK_FORMATS[fmt], word, 5, 3, 0, 0, 1, 1, 0]
     assert struct.unpack_from("<2Q", data, 64) == (0, 0)
     start, length, plain = struct.unpack_from("<3Q", data, LEVEL)
     assert length == plain == len(_data(fmt)) and data[start:] == _data(fmt)

@@ -18,7 +18,7 @@ from wlm.formats.exr import write_exr
 from wlm.formats.hdr_blocks import ASTC_BLOCKS
 from wlm.formats.light import read_light
 
-RGB, RGBA = ("R", "G", "B"), ("R", "G", "B", "A")
+RGB, RGBA, PNG = ("R", "G", "B"), ("R", "G", "B", "A"), b"\x89PNG\r\n\x1a\n"
 # Byte offsets, from the specifications.
 FORMAT, HEIGHT, LAYERS, FACES, SCHEME, DESCRIPTOR_AT, LEVEL, TRANSFER = 12, 24, 32, 36, 44, 48, 80, 118
 DDS_SIZE, DDS_HEIGHT, DDS_FLAGS, DDS_CODE, DDS_CAPS2 = 4, 12, 80, 84, 112
@@ -162,10 +162,7 @@ def test_kinds_are_told_by_content(tmp_path):
     for content, found in (
         (b"", "an empty file"),
         (b"no lightmap", "other content"),
-        (
-            b"\x89PNG\r\n\x1a\n",
-            "a PNG: state what light its numbers stand for with --encoding (linear, srgb, rgbm, ...)",
-        ),
+        (PNG, "a PNG: state what light its numbers stand for with --encoding (linear, srgb, rgbm, ...)"),
         (b"\xabKTX 11\xbb\r\n\x1a\n", "a KTX file of version 1"),
     ):
         (tmp_path / "a.exr").write_bytes(content)

@@ -1,5 +1,4 @@
-"""Meshes in formats other than glTF: positions, UVs and triangles as they are in the file, and one line where it is
-damaged."""
+"""Meshes in formats other than glTF: positions, UVs, triangles and fronts, and one line where a file is damaged."""
 
 from pathlib import Path
 
@@ -7,7 +6,9 @@ import numpy as np
 import pytest
 import trimesh
 from builders.checks import error_of
+from builders.gltf_scene import box
 
+from wlm.formats.geometry import Geometry
 from wlm.formats.meshes import MeshArrays, read_mesh
 
 SQUARE = """# a square
@@ -53,12 +54,10 @@ def test_a_polygon_is_triangles_and_v_points_down(tmp_path, face):
 def test_a_vertex_is_a_pair_of_v_and_vt(tmp_path):
     mesh = _read(tmp_path, SQUARE + "f 1/1 2/2 3/3\nf 1/1 3/2 4/4\nf 3/2 3/3 1/4")
     assert len(mesh.position) == len(mesh.uv) == 6
-    np.testing.assert_array_equal(
-        mesh.position[mesh.triangle][1:, :, :2], [[[0, 0], [2, 3], [0, 3]], [[2, 3], [2, 3], [0, 0]]]
-    )
-    np.testing.assert_array_equal(
-        mesh.uv[mesh.triangle][1:], [[[0, 1], [1, 1], [0, 0.25]], [[1, 1], [1, 0], [0, 0.25]]]
-    )
+    seen = mesh.position[mesh.triangle][1:, :, :2]
+    np.testing.assert_array_equal(seen, [[[0, 0], [2, 3], [0, 3]], [[2, 3], [2, 3], [0, 0]]])
+    seen = mesh.uv[mesh.triangle][1:]
+    np.testing.assert_array_equal(seen, [[[0, 1], [1, 1], [0, 0.25]], [[1, 1], [1, 0], [0, 0.25]]])
 
 
 def test_several_materials_are_one_mesh(tmp_path):
@@ -119,3 +118,19 @@ def test_many_corners_and_materials_are_refused_before_they_are_read(tmp_path):
 def test_a_missing_file_and_another_format(tmp_path):
     assert "No such file" in error_of(read_mesh, tmp_path / "a.obj")
     assert "expected a mesh file" in error_of(read_mesh, tmp_path / "a.fbx")
+
+
+@pytest.mark.parametrize("size", [1.0, 1e-20, 1e18])
+def test_a_room_faces_its_middle(size):
+    position, triangle, uv = box((-1, -1, -1), (1, 1, 1))
+    position = (np.array([5.0, -2.0, 0.5]) + position * [1.0, 2.0, 0.5]) * size
+    walls, outside = (Geometry(position.astype(np.float32), faces, uv) for faces in (triangle[:, ::-1], triangle))
+    assert walls.is_room and not outside.is_room
+    mixed = np.concatenate([walls.triangle[:6], outside.triangle[6:]])
+    assert not Geometry(walls.position, mixed, uv).is_room
+
+
+def test_a_plane_and_nothing_are_no_rooms():
+    position, triangle, uv = box((-1, -1, -1), (1, 1, 1))
+    assert not Geometry((position * [1, 0, 1]).astype(np.float32), triangle[:, ::-1], uv).is_room
+    assert not Geometry(position.astype(np.float32), np.zeros((0, 3), np.uint32), uv).is_room

@@ -1,8 +1,11 @@
 """Zstandard frames: round trip, and one line for every damaged frame."""
 
+import re
+
 import numpy as np
 import pytest
 import zstandard
+from builders.checks import misuse_of
 
 from wlm.formats.zstd import compress, decompress
 
@@ -18,8 +21,7 @@ def test_round_trip(size):
 def test_damaged_frames_are_refused():
     frame = compress(bytes(5000))
     for damaged in (frame[:-1], frame + b"x", frame + frame, b"", b"no frame at all", frame[:6] + b"\xff" + frame[7:]):
-        with pytest.raises(ValueError, match="^tile 3: "):
-            decompress(damaged, 5000, "tile 3")
+        assert re.search("^tile 3: ", misuse_of(decompress, damaged, 5000, "tile 3"))
 
 
 def test_frame_of_another_size_is_refused():
@@ -27,5 +29,4 @@ def test_frame_of_another_size_is_refused():
         decompress(compress(bytes(5000)), 4999, "tile")
     packer = zstandard.ZstdCompressor(write_content_size=False)
     for size in (4999, 5001):
-        with pytest.raises(ValueError, match="^tile: "):
-            decompress(packer.compress(bytes(5000)), size, "tile")
+        assert re.search("^tile: ", misuse_of(decompress, packer.compress(bytes(5000)), size, "tile"))

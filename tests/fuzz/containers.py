@@ -30,19 +30,7 @@ _TYPES = {"BOOL": "?", "U8": "u1", "I8": "i1", "U16": "<u2", "I16": "<i2", "F16"
 _TYPES |= {"F32": "<f4", "U64": "<u8", "I64": "<i8", "F64": "<f8"}
 _TYPE_NAMES = {np.dtype(kind): name for name, kind in _TYPES.items()}
 _QUOTES = str.maketrans({'"': "'", "'": '"'})
-_NAMES = (
-    "x",
-    "uv",
-    "lut",
-    "kind",
-    "times",
-    "colour",
-    "finished.0.uv",
-    "running.0.step",
-    "running.1.x",
-    "running.x",
-    "",
-)
+_NAMES = *"x uv lut kind times colour finished.0.uv running.0.step running.1.x running.x".split(), ""
 
 
 def open_artifact(data: bytes) -> tuple[dict[str, Any], bytes]:
@@ -190,13 +178,7 @@ _WRONG_HEADERS = (
     "{'descr': '<f4', 'fortran_order': False, 'shape': " + "(" * 300 + ")" * 300 + ", }",
     "9" * 5000,
 )
-_OBJECTS = (
-    np.array([None, {}], object),
-    np.array("x"),
-    np.array(["a", "b"]),
-    np.zeros(2, [("a", "f4")]),
-    np.float64(3),
-)
+_OBJECTS = *map(np.array, ("x", ["a", "b"], np.float64(3))), np.array([None, {}], object), np.zeros(2, [("a", "f4")])
 
 # Most often those that are read.
 _METHODS = (*(zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) * 4, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA)
@@ -274,9 +256,8 @@ def _multiplied(draw: Random, content: Any) -> Any:
     """A glTF file whose nodes draw many primitives, some of accessors without data, or that names other files."""
     kind, meshes = draw.randrange(4), content["meshes"]
     if kind == 0:
-        content["accessors"].append(
-            {"componentType": 5126, "type": "VEC3", "count": draw.choice((1, 3, 1 << 20, 1 << 28))}
-        )
+        count = draw.choice((1, 3, 1 << 20, 1 << 28))
+        content["accessors"].append({"componentType": 5126, "type": "VEC3", "count": count})
         for primitive in meshes[0]["primitives"]:
             primitive["attributes"][draw.choice(("POSITION", "NORMAL"))] = len(content["accessors"]) - 1
     elif kind == 1:
@@ -352,9 +333,8 @@ def vary_exr(draw: Random, data: bytes, note: str = "") -> bytes:
             chosen[2] = struct.pack("<4i", *window)
         else:
             chosen[2] = corrupt(draw, chosen[2])
-    header = b"".join(
-        name + b"\0" + kind + b"\0" + struct.pack("<I", len(value)) + value for name, kind, value in attributes
-    )
+    rows = [(name, kind, struct.pack("<I", len(value)) + value) for name, kind, value in attributes]
+    header = b"".join(map(b"\0".join, rows))
     moved = 8 + len(header) + 1 - table
     body = bytearray(data[table:])
     for place in range(0, struct.unpack_from("<Q", data, table)[0] - table, 8):
@@ -377,9 +357,7 @@ def vary_png(draw: Random, data: bytes) -> bytes:
         elif kind == 1:
             chunks.insert(number, draw.choice(chunks))
         elif kind == 2:
-            name = draw.choice(
-                (b"IHDR", b"PLTE", b"IDAT", b"IEND", b"tRNS", b"zTXt", b"iCCP", b"acTL", b"eXIf", b"xxxx")
-            )
+            name = draw.choice(b"IHDR PLTE IDAT IEND tRNS zTXt iCCP acTL eXIf xxxx".split())
             chunks.insert(number, (name, draw.choice((b"", content, b"x\0\0" + zlib.compress(bytes(1 << 20))))))
         elif name == b"IDAT" and kind == 3:
             chunks[number] = (name, zlib.compress(corrupt(draw, _inflated(content))))

@@ -14,22 +14,7 @@ _NEAR = (8, 16, 32, 64, 128, 256, 512, 1000, 4096, 16384, 65536, 1 << 20, 1 << 2
 INTEGERS = (*range(10), *(value + shift for value in _NEAR for shift in (-1, 0, 1)))
 FLOATS = (math.nan, math.inf, -math.inf, 0.0, -0.0, 1.0, -1.0, 0.5, 1e-45, 1e-30, 65504.0, 1e30, -1e30, 3.4e38, 1e300)
 _SIGNED = (-1, -2, -128, -(1 << 31), -(1 << 63), 10**30, 10**400)
-_TEXTS = (
-    "",
-    " ",
-    "x",
-    "x" * 5000,
-    "\0",
-    "a\nb",
-    "\x1b[31m",
-    "\u202e",
-    "\ud800",
-    "é",
-    "nan",
-    "1e999",
-    "../x",
-    "/dev/zero",
-)
+_TEXTS = *"x é nan 1e999 ../x /dev/zero".split(), "", " ", "x" * 5000, "\0", "a\nb", "\x1b[31m", "\u202e", "\ud800"
 NAMES = ("../a.exr", "/etc/passwd", "/dev/zero", "/dev/stdin", "..", ".", "x" * 5000, "\ud800", "a.exr\n", "mask.png")
 """File names that a reader must not follow, or cannot."""
 

@@ -280,10 +280,8 @@ def _tiles(draw: Random, data: bytes) -> bytes:
     node = tree(values, np.ones(values.shape, bool), ACTIVE_MASK)[
         28:
     ]  # of tiles, without the root's head and its place
-    nodes, tiles = (
-        draw.choice(((1, 0), (2, 0), (1, 40), (6, 3), (0, 2000))),
-        (0, 8, -8, 1, 100, 4095, 4096, -4096, 1 << 20),
-    )
+    nodes = draw.choice(((1, 0), (2, 0), (1, 40), (6, 3), (0, 2000)))
+    tiles = (0, 8, -8, 1, 100, 4095, 4096, -4096, 1 << 20)
     root = struct.pack("<If2I", 1, draw.choice((0.0, 1.0, -1.0)), nodes[1], nodes[0])
     for _ in range(nodes[1]):
         root += struct.pack("<3if?", *draw.choices(tiles, k=3), draw.choice((0.0, 0.5, 1e30)), draw.random() < 0.9)
@@ -362,10 +360,8 @@ def _layers() -> Sequence[bytes]:
     one = {"name": "day", "layers": layers, "period_hours": 24, "lightmaps": lightmaps}
     two = {"layers": {"light": "radiance"}, "lightmaps": [{"time_hours": 0.0, "files": files}]}
     atlas = {"width": 10, "height": 12, "mask": "mask.png"}
-    return tuple(
-        json.dumps(content).encode()
-        for content in (one | {"atlases": {"0": atlas}}, two | {"atlases": {"0": {"mask": "all"}, "1": {}}})
-    )
+    contents = one | {"atlases": {"0": atlas}}, two | {"atlases": {"0": {"mask": "all"}, "1": {}}}
+    return tuple(json.dumps(content).encode() for content in contents)
 
 
 def _frames(path: Path) -> None:
@@ -426,18 +422,8 @@ yes
 {a: 1
 :
 """.strip().split("\n"),
-    *(
-        "0x" + "f" * 5000,
-        "1" * 5000,
-        "1" * 400 + ".5",
-        "9:" * 300 + "9.5",
-        "0b" + "1" * 5000,
-        "[" * 300,
-        "{" * 300,
-        "- " * 300,
-        "\0",
-        "\t",
-    ),
+    *("0x" + "f" * 5000, "1" * 5000, "1" * 400 + ".5", "9:" * 300 + "9.5", "0b" + "1" * 5000, "\0", "\t"),
+    *(each * 300 for each in ("[", "{", "- ")),
 ]
 
 

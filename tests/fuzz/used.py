@@ -28,17 +28,7 @@ from wlm.formats.exr import write_exr
 from .reader import CORPUS, FILES, Reader, check_finite
 
 MESHES = ("mesh.glb", "mesh.gltf", "mesh.obj", "atlas.glb")
-LIGHTS = (
-    "light.exr",
-    "tiled.exr",
-    "wide.exr",
-    "plain.hdr",
-    "light.pfm",
-    "bc6h.dds",
-    "half-mips.ktx2",
-    "nan.exr",
-    "layers.exr",
-)
+LIGHTS = tuple("light.exr tiled.exr wide.exr plain.hdr light.pfm bc6h.dds half-mips.ktx2 nan.exr layers.exr".split())
 LEVELS = ("mask-rgba.png", "mask-grey.png", "levels.jpg", "flipbook.tga", "strips.tif")
 LIGHTMAPS = ("lightmap.wlm", "lightmap-frames.wlm", "lightmap-layers.wlm")
 ATLASES = tuple(f"atlas-{kind}.wlm" for kind in ("tiles", "mixed", "cascade", "bc6h", "plain", "shared", "separate"))
@@ -49,19 +39,7 @@ SETS = ("set", "alpha", "mixed", "gone")
 VOLUMES = ("volume.npz", "volume-bricks.npz", "openvdb.vdb", "huge.npz")
 BOOKS = ("flipbook.png", "flipbook.tga", "mask-rgba.png", "mask-grey.png", "large.png", "six-way.exr", "light.exr")
 LISTS = tuple(f"list-{i}.json" for i in range(4))
-ENCODINGS = (
-    "linear",
-    "srgb",
-    "rgbm",
-    "rgbm:1e-30:9",
-    "rgbm:99999:8",
-    "rgbd",
-    "rgbd:1:1",
-    "dldr",
-    "rgbe",
-    "layer:View.Bake",
-    "x",
-)
+ENCODINGS = tuple("linear srgb rgbm rgbm:1e-30:9 rgbm:99999:8 rgbd rgbd:1:1 dldr rgbe layer:View.Bake x".split())
 QUICK = ("--views", "1", "--resolution", "16")
 TIMES = ("18.5", "-5", "1e300", "nan", "25.5")
 LAYOUTS = ("unity", "o3de", "embergen")
@@ -121,12 +99,7 @@ def _files() -> dict[str, bytes]:
         write_exr(folder / "alpha.exr", checked)
         Image.new("RGBA", (300, 200), (9, 200, 30, 100)).save(folder / "large.png")
         np.savez(folder / "huge.npz", density=np.full((4, 5, 6), 3e38, np.float32), voxel=1e-30)
-        places = {
-            "small.exr": [1, 1, 0, 0],
-            "nan.exr": [0, 0, 0, 0],
-            "wide.exr": [9, 9, -3, -3],
-            "../x.exr": [1, 1, 0, 0],
-        }
+        places = {"small.exr": [1, 1, 0, 0], "nan.exr": [0] * 4, "wide.exr": [9, 9, -3, -3], "../x.exr": [1, 1, 0, 0]}
         for i, (file, place) in enumerate(places.items()):
             objects = [{"node": node, "sheet": 0, "scale_offset": place} for node in ("left", "mesh", "")]
             listing = {"states": ["a"], "convention": "gltf", "sheets": [{"files": [file]}], "objects": objects}
@@ -155,9 +128,8 @@ def _use(path: Path) -> None:
             (folder / name).write_bytes(files[name])
         before = set(folder.rglob("*"))
         names = {*files, *SETS}
-        result = CliRunner().invoke(
-            app, [f"{folder}/{word}" if word in names or word[:3] == "OUT" else word for word in words]
-        )
+        words = [f"{folder}/{word}" if word in names or word[:3] == "OUT" else word for word in words]
+        result = CliRunner().invoke(app, words)
         after = sorted(set(folder.rglob("*")) - before)
         if result.exception is not None and not isinstance(result.exception, SystemExit):
             raise result.exception

@@ -123,13 +123,8 @@ def draw(trainer: Trainer, quantised: bool) -> tuple[np.ndarray, np.ndarray]:
         trainer._round()
         place = wp.zeros(shape, dtype=wp.vec3i, device=trainer.device)
         features = wp.zeros(shape, dtype=kernels.net.vec_in, device=trainer.device)
-        wp.launch(
-            kernels.draw,
-            shape,
-            inputs=[trainer._maps[quantised], trainer.batch, samples],
-            outputs=[place, features],
-            device=trainer.device,
-        )
+        inputs, outputs = [trainer._maps[quantised], trainer.batch, samples], [place, features]
+        wp.launch(kernels.draw, shape, inputs=inputs, outputs=outputs, device=trainer.device)
     return place.numpy(), features.numpy()
 
 
@@ -157,9 +152,8 @@ def fused_step(trainer: Trainer, quantised: bool) -> Step:
     with interop.stream(trainer.device):
         trainer._round()
         trainer._add_gradients(int(quantised))
-        flat, hidden, output = (
-            values.sum(0).cpu().numpy() for values in (trainer._acc, trainer._partial, trainer._partial_out)
-        )
+        sums = (trainer._acc, trainer._partial, trainer._partial_out)
+        flat, hidden, output = (values.sum(0).cpu().numpy() for values in sums)
         trainer._update(int(quantised))
     flat = flat if trainer.device == "cpu" else (flat * 2.0**-40).astype(np.float32)
     grads, at = {}, 0
@@ -196,15 +190,8 @@ class Problem:
     def features(self) -> torch.Tensor:
         """The network's inputs, centred and with the noise, [N, B, 16]."""
         flat = self.place.reshape(-1, 3)
-        features = reference.train_features(
-            self.maps,
-            self.tile,
-            flat[:, :2],
-            self.tau.flatten(),
-            self.encoding.reshape(-1, 4),
-            self.periodic,
-            self.quantised,
-        )
+        coded = (self.tau.flatten(), self.encoding.reshape(-1, 4), self.periodic, self.quantised)
+        features = reference.train_features(self.maps, self.tile, flat[:, :2], *coded)
         return reference.centre(features).reshape(self.noise.shape) + self.noise
 
     def losses(self) -> torch.Tensor:

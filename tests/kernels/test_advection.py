@@ -281,10 +281,8 @@ def test_turned_sources(shape: str, device: str):
     far = np.abs(away)
     if shape == "mesh":
         points, triangles = surface("sphere")
-        arrays = (
-            wp.array(points + (0.5, 0, 0), dtype=wp.vec3, device=device),
-            wp.array(triangles.ravel(), dtype=int, device=device),
-        )
+        points = wp.array(points + (0.5, 0, 0), dtype=wp.vec3, device=device)
+        arrays = (points, wp.array(triangles.ravel(), dtype=int, device=device))
         mesh = wp.Mesh(*arrays, support_winding_number=True)
         source = advection_sources.make_region(mesh, centre, size, extent=(1.5, 1.0, 1.0), turn=turn.as_quat())
         reach = np.linalg.norm(away - (0.5, 0, 0), axis=-1)

@@ -17,7 +17,7 @@ from benchmarks import matrix_tiles, smoke_path
 from wlm_kernels import mlp
 from wlm_kernels.fluid import advection, advection_sources, fire, lattice, lattice_bodies, lattice_fields, lattice_links
 from wlm_kernels.lightmap import decode as lightmap_decode
-from wlm_kernels.lightmap import matrix_pages, pages
+from wlm_kernels.lightmap import gather, matrix_pages, pages
 from wlm_kernels.lightmap import step as lightmap_step
 from wlm_kernels.probe import decode as probe_decode
 from wlm_kernels.probe import gaussian_sum
@@ -74,9 +74,8 @@ def _members(*built: object) -> list:
 def _probe_network(shape: tuple[int, int, int]) -> list:
     latent, hidden, outputs = shape
     decoder = probe_decode.decode_kernels(latent, hidden, outputs, True, 3, "cuda")
-    return _members(
-        probe_network.network_kernels(latent, hidden, outputs + 1, "cuda"), decoder, *decoder._kernels.values()
-    )
+    network = probe_network.network_kernels(latent, hidden, outputs + 1, "cuda")
+    return _members(network, decoder, *decoder._kernels.values())
 
 
 def _smoke(dtype: type) -> list:
@@ -119,6 +118,7 @@ def _cases(name: str, build: Callable, quick: list[tuple], *axes: tuple) -> Iter
 FACTORIES = [
     *_cases("mlp", lambda *of: mlp.kernels(16, *of), [], WIDTHS, ("fast", "exact", "tanh"), (3, 5)),
     *_cases("step", lambda *of: lightmap_step.step_kernels(*of, "cuda"), [], (16, 64), ("tanh", "exact")),
+    *_cases("muon", lambda width: [gather._turn_kernel(width, width * width // 8)], [(64,)], (16, 32, 48, 64)),
     *_cases("exact_decode", lambda width: [lightmap_decode.exact_kernel(width, "tanh")], [], WIDTHS),
     *_cases("matrix_tiles", matrix_tiles.matrix_kernels, [], (16, 48, 64), (4, 32, 128)),
     *_cases("pages", lambda *of: [pages.page_kernel(*of)], [], (8, 16, 64), ("fast", "exact")),
@@ -132,12 +132,7 @@ FACTORIES = [
         "lattice_boundaries", _boundaries, [], (("D3Q19", "float32"), ("D2Q9", "float32"), ("D3Q27", "float16")), BOTH
     ),
     *_cases("fire", lambda stored: [fire.burn_kernel(stored)], [], FLOATS),
-    *_cases(
-        "expansion",
-        lambda storage: [fire.expand_kernel("D3Q19", storage, storage == "float16")],
-        [],
-        ("float32", "float16"),
-    ),
+    *_cases("expansion", lambda of: [fire.expand_kernel("D3Q19", of, of == "float16")], [], ("float32", "float16")),
     *_cases("marks", lambda is_mesh: [lattice_bodies._mark_kernel(is_mesh)], [], BOTH),
     *_cases("advection", _advection, [], BOTH, BOTH, FLOATS),
     *_cases("planes", _planes, [], BOTH),

@@ -11,6 +11,7 @@ from reference.levels import put_on_levels
 from kernels.compare import array, close
 from kernels.stepping import Case, fused_step, trainer
 from wlm_kernels.lightmap import features, gather, levels
+from wlm_kernels.lightmap.features import INPUTS
 
 RATES = {"map_rate": 0.02, "net_rate": 0.005, "final_rate": 0.1}
 
@@ -28,9 +29,8 @@ def test_gather_clears_clamps_and_counts(device: str):
         before = fit.maps.clone()
         grads = fused_step(fit, False).grads
         share = _share(min(step, 11), 12, 0.1)  # beyond the last step its rate stays
-        np.testing.assert_allclose(
-            fit._rates[:2].cpu().numpy(), [0.02 * share, 0.005 * share], rtol=1e-5, err_msg=f"step {step}"
-        )
+        want = [0.02 * share, 0.005 * share]
+        np.testing.assert_allclose(fit._rates[:2].cpu().numpy(), want, rtol=1e-5, err_msg=f"step {step}")
         # Adam moves a value by hardly more than its rate.
         assert float((fit.maps - before).abs().max()) < 0.02 * share * 4.0
         assert float(fit.maps.min()) == 0.0 and float(fit.maps.max()) == 1.0
@@ -67,6 +67,45 @@ def test_adam_is_torchs(device: str):
             whole[0].clamp_(0.0, 1.0)
     for name, value, mine in zip(("maps", "hidden", "output"), whole, named, strict=True):
         close(mine, value, 2e-5, name)
+    fit.close()
+
+
+def _turn(hidden: np.ndarray, rate: float) -> np.ndarray:
+    """Moves of hidden layers [18 + H, H] by Muon, from their momentum; none of biases."""
+    moved, width = np.zeros(hidden.shape), hidden.shape[1]
+    for layer in (slice(INPUTS), slice(INPUTS + 1, INPUTS + 1 + width)):
+        x = hidden[layer].astype(np.float64)
+        x /= max(np.linalg.norm(x), 1e-300)
+        for _ in range(5):
+            gram = x @ x.T
+            x = 3.4445 * x + (-4.775 * gram + 2.0315 * gram @ gram) @ x
+        moved[layer] = -rate * 0.2 * max(x.shape) ** 0.5 * x
+    return moved
+
+
+@pytest.mark.parametrize("hidden", [5, 16, 48, 64])
+def test_muon_moves_layers_along_their_orthogonal_momentum(device: str, hidden: int):
+    """Of singular values over three decades, of rank 1 and 0; in a fit, where biases move with Adam."""
+    if device != "cpu" and hidden % 16:
+        pytest.skip("a GPU has no network of this width")
+    random = np.random.default_rng(hidden)
+    momentum = random.normal(size=(3, INPUTS + 2 + hidden, hidden)) * 10.0 ** random.uniform(-10, -7, hidden)
+    momentum[1] = np.outer(momentum[1, :, 0], momentum[1, 0]) * 1e7
+    momentum[2] = 0.0
+    start = random.normal(size=momentum.shape).astype(np.float32)
+    weights = array(start.ravel(), float, device)
+    rates = array(np.array([[7.0, 0.5, 7.0, 7.0]], np.float32), wp.vec4, device)
+    gather.turn(hidden, rates, array(momentum.astype(np.float32).ravel(), float, device), weights)
+    want = np.stack([_turn(each, 0.5) for each in momentum.astype(np.float32)])
+    # A GPU's operands are half floats.
+    moved = weights.numpy().reshape(start.shape) - start
+    np.testing.assert_allclose(moved, want, atol=2e-5 if device == "cpu" else 0.01)
+    fit = trainer(Case(hidden=hidden, settings={"muon": True, "net_rate": 0.01}), device)
+    start = fit.hidden.cpu().numpy().copy()
+    grads = fused_step(fit, False).grads["hidden"]
+    want, biases = np.stack([_turn(each, 0.01) for each in grads]), np.s_[:, [INPUTS, INPUTS + 1 + hidden]]
+    want[biases] = -0.01 * grads[biases] / (np.abs(grads[biases]) + 1e-8)
+    np.testing.assert_allclose(fit.hidden.cpu().numpy() - start, want, atol=1e-6 if device == "cpu" else 2e-4)
     fit.close()
 
 

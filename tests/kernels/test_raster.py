@@ -30,11 +30,8 @@ def _scene(kind: str, count: int = 40) -> tuple[np.ndarray, np.ndarray]:
     middle = random.uniform(-1.2, 1.2, (count, 1, 2))
     xy = (middle + random.normal(scale=0.4, size=(count, 3, 2))).reshape(-1, 2)
     z = random.uniform(-1, 1, (3 * count, 1))
-    w = {
-        "flat": np.ones_like(z),
-        "perspective": random.uniform(0.3, 3.0, z.shape),
-        "behind": random.uniform(-1.0, 1.0, z.shape),
-    }
+    w = {"flat": np.ones_like(z), "perspective": random.uniform(0.3, 3.0, z.shape)}
+    w["behind"] = random.uniform(-1.0, 1.0, z.shape)
     if kind == "uv":
         return ((xy + 1) / 2).astype(np.float32), triangle
     return np.concatenate([xy * np.abs(w[kind]), z, w[kind]], 1).astype(np.float32), triangle

@@ -525,12 +525,8 @@ def test_a_set_names_layers_channels_and_slices(tmp_path):
     write_planes(tmp_path / "order.exr", dict.fromkeys(("A", "B", "BA", "G", "R"), planes["R"]))
     assert read_channels(tmp_path / "order.exr")[1] == ("R", "G", "B", "A", "BA")
     layers["dir"]["channels"] = ["G", "R"]
-    both = write_set_json(
-        tmp_path,
-        layers=layers,
-        atlases={"big": {}},
-        lightmaps=[{"time_hours": 3.0, "files": {"big": first | {"dir": "more.exr"}}}],
-    )
+    maps = [{"time_hours": 3.0, "files": {"big": first | {"dir": "more.exr"}}}]
+    both = write_set_json(tmp_path, layers=layers, atlases={"big": {}}, lightmaps=maps)
     directions = values_of(wlm.lightmap.load(both), "big", "dir")[0]
     np.testing.assert_allclose(directions, np.stack([planes["G"], planes["R"]], -1), atol=1e-6)
 

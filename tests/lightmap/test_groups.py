@@ -67,12 +67,8 @@ def test_what_is_written_comes_back(model, tmp_path):
     assert [name for name in stored if name.endswith("mask")] == ["0.mask"]
     assert sorted(name for name in stored if name.endswith("times")) == ["1.times", "2.times", "3.times", "times"]
     sizes = back.group_sizes()
-    assert {name: times.tolist() for name, (times, _) in sizes.items()} == {
-        "sky": [0.0, 7.5, 13.0, 19.0],
-        "sun": [6.0, 12.5, 18.0],
-        "lamp": [0.0],
-        DARK: [0.0],
-    }
+    times = {"sky": [0.0, 7.5, 13.0, 19.0], "sun": [6.0, 12.5, 18.0], "lamp": [0.0], DARK: [0.0]}
+    assert {name: own.tolist() for name, (own, _) in sizes.items()} == times
     assert sum(each for _, each in sizes.values()) == back.memory_bytes and sizes[DARK][1] < sizes["sky"][1]
     # A lamp's only time is no time at which light changes.
     assert back.times.tolist() == [0.0, 6.0, 7.5, 12.5, 13.0, 18.0, 19.0]
@@ -184,9 +180,8 @@ def test_sets_are_joined_by_the_rules(sets):
 def test_groups_are_read_from_a_list_and_from_options(sets, tmp_path):
     path = write_groups(tmp_path / "lit", sets)
     read = load(path)
-    for (sheet, own), (other, expected) in zip(
-        read.sheets.items(), from_groups(sets, "lit").sheets.items(), strict=True
-    ):
+    whole = from_groups(sets, "lit").sheets.items()
+    for (sheet, own), (other, expected) in zip(read.sheets.items(), whole, strict=True):
         assert sheet == other
         np.testing.assert_array_equal(own.frames, expected.frames)
         assert own.times.tolist() == expected.times.tolist() and own.period == 24.0

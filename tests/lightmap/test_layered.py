@@ -117,9 +117,8 @@ def test_scores_are_relative_to_the_encodings_range(fitted, tmp_path):
     decoder, original = model.decoder(), turning_directions(hours=hours)
     light, directions, _ = report.sheets.values()
     # Of values in [-1, 1]: the peak is 2, wherever the tile's own values are.
-    expected = [
-        10 * np.log10(4.0 / np.square(decoder.frame(h, "dir") - o).mean()) for h, o in zip(hours, original, strict=True)
-    ]
+    pairs = zip(hours, original, strict=True)
+    expected = [10 * np.log10(4.0 / np.square(decoder.frame(h, "dir") - o).mean()) for h, o in pairs]
     np.testing.assert_allclose(directions.psnr_by_time, expected, atol=1e-3)
     worst = max(np.abs(decoder.frame(h, "dir") - o).max() for h, o in zip(hours, original, strict=True))
     assert directions.max_abs_error == pytest.approx(worst, rel=1e-4)
@@ -173,9 +172,7 @@ def test_a_bundle_has_a_part_for_each_sheet():
     model = random_layers()
     bundle = model.bundle()
     listed = bundle.document["sheets"]
-    assert [(item["layer"], item["channels"]) for item in listed] == [
-        (sheet.layer, list(sheet.channels)) for sheet in SHEETS
-    ]
+    assert [(each["layer"], each["channels"]) for each in listed] == [(own.layer, list(own.channels)) for own in SHEETS]
     assert list(bundle.parts) == [item["part"] for item in listed] and not bundle.textures
     light, directions = (bundle.parts[item["part"]] for item in listed[:2])
     assert directions.document["values"] == [-1.0, 1.0]

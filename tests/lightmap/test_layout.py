@@ -41,9 +41,7 @@ def test_another_atlas_among_them_is_told(options):
     frames = [picture(charts(0), seed, **options) for seed in range(4)]
     frames[2] = picture(charts(1), 2, **options)
     (warning,) = from_arrays(frames, range(4), name="day").warnings
-    assert (
-        warning.startswith("day: frame ") and "frame 2 (time 2)" in warning and "don't look like one atlas" in warning
-    )
+    assert all(words in warning for words in ("day: frame ", "frame 2 (time 2)", "don't look like one atlas"))
 
 
 def test_little_to_tell_by_is_no_reason():

@@ -29,12 +29,8 @@ def _box(x, y, width, height):
 def test_windows_that_move_between_hours_stay_in_place(tmp_path):
     display = _box(0, 0, 32, 24)
     for hour, x in ((0, 0), (6, 4), (12, 8)):
-        _write(
-            tmp_path / f"a_{hour:02d}h.exr",
-            LIGHT[2:22, x : x + 20],
-            dataWindow=_box(x, 2, 20, 20),
-            displayWindow=display,
-        )
+        box, path = _box(x, 2, 20, 20), tmp_path / f"a_{hour:02d}h.exr"
+        _write(path, LIGHT[2:22, x : x + 20], dataWindow=box, displayWindow=display)
     sheet = wlm.lightmap.load(tmp_path).light
     for frame, x in zip(sheet.frames, (0, 4, 8), strict=True):
         expected = np.zeros_like(LIGHT)
@@ -47,11 +43,8 @@ def test_windows_that_move_between_hours_stay_in_place(tmp_path):
 
 def test_a_line_that_all_files_share_is_printed_once(tmp_path):
     for hour in (0, 6, 12):
-        _write(
-            tmp_path / f"a_{hour:02d}h.exr",
-            LIGHT,
-            chromaticities=(0.708, 0.292, 0.17, 0.797, 0.131, 0.046, 0.3127, 0.329),
-        )
+        wide = (0.708, 0.292, 0.17, 0.797, 0.131, 0.046, 0.3127, 0.329)
+        _write(tmp_path / f"a_{hour:02d}h.exr", LIGHT, chromaticities=wide)
     line = "a_00h.exr and 2 more: converted to Rec. 709 from Rec. 2020"
     assert line in wlm.lightmap.load(tmp_path).warnings
     assert line in inspect(tmp_path)[0].problems
@@ -84,11 +77,8 @@ def test_integers_with_an_encoding(tmp_path, suffix):
 
 
 def test_a_layer_is_chosen_by_name_in_a_set_and_for_a_mesh(tmp_path):
-    planes = {
-        f"{name}.{letter}": LIGHT[..., i] * (1 + (name == "Gloss"))
-        for name in ("Diff", "Gloss")
-        for i, letter in enumerate("RGB")
-    }
+    names = [(name, i) for name in ("Diff", "Gloss") for i in range(3)]
+    planes = {f"{name}.{'RGB'[i]}": LIGHT[..., i] * (1 + (name == "Gloss")) for name, i in names}
     planes = {name: np.ascontiguousarray(plane) for name, plane in planes.items()}
     for hour in (0, 6):
         OpenEXR.File({"type": OpenEXR.scanlineimage}, dict(planes)).write(str(tmp_path / f"a_{hour:02d}h.exr"))

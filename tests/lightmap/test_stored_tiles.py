@@ -306,9 +306,8 @@ def test_a_damaged_tile_does_not_stop_the_loader(path):
         while len(got) < 3 and loader.wait(30.0):
             got += loader.take()
     assert [each.tile is None for each in got] == [False, True, False]
-    assert str(got[1].error) == (
-        f"{path}: sheet random: tile 1: the file is damaged here: the bytes do not match their digest"
-    )
+    said = "sheet random: tile 1: the file is damaged here: the bytes do not match their digest"
+    assert str(got[1].error) == f"{path}: {said}"
 
 
 class Held:

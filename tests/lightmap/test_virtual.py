@@ -143,10 +143,8 @@ def test_mips_are_means_of_all_texels(time, device):
 
 
 def test_values_that_are_not_light_have_their_own_gamma(device):
-    sheets = {
-        LIGHT: random_sheet((3, 3)),
-        Sheet("0", "dir", encoding="signed"): random_sheet((3, 4), gamma=1.0, seed=1),
-    }
+    directions = random_sheet((3, 4), gamma=1.0, seed=1)
+    sheets = {LIGHT: random_sheet((3, 3)), Sheet("0", "dir", encoding="signed"): directions}
     model = LightmapModel("two", "0123456789abcdef", sheets[LIGHT].profile, sheets)
     with VirtualTexture(model, device, **SMALL, decodes=64) as virtual:
         for s, own in enumerate(sheets.values()):
@@ -374,9 +372,8 @@ def test_groups_are_added_by_their_weights(device):
         check_tables(virtual)
         assert "expected a group among sky, sun, lamp" in error_of(virtual.set_weights, {"moon": 1.0})
     sheets = {replace(LIGHT, group=str(i)): model.light for i in range(9)}
-    assert error_of(VirtualTexture, LightmapModel("nine", "0" * 16, model.profile, sheets)) == (
-        "nine: expected at most 8 light groups, got 9"
-    )
+    nine = LightmapModel("nine", "0" * 16, model.profile, sheets)
+    assert error_of(VirtualTexture, nine) == "nine: expected at most 8 light groups, got 9"
 
 
 def test_tiles_are_loaded_when_they_are_needed(tmp_path, device):

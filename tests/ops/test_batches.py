@@ -99,9 +99,8 @@ def test_derivatives_of_a_footprint(device: str):
     at, slopes = ops.interpolate(uv, triangle, raster, derivatives=True)
     right, down = at[1:-1, 2:] - at[1:-1, :-2], at[2:, 1:-1] - at[:-2, 1:-1]
     # The two triangles, which differ in their slopes, meet on the diagonal.
-    same = (raster.triangle[1:-1, 2:] == raster.triangle[1:-1, :-2]) & (
-        raster.triangle[2:, 1:-1] == raster.triangle[:-2, 1:-1]
-    )
+    drawn = raster.triangle
+    same = (drawn[1:-1, 2:] == drawn[1:-1, :-2]) & (drawn[2:, 1:-1] == drawn[:-2, 1:-1])
     assert same.float().mean() > 0.9
     close(slopes[1:-1, 1:-1][same], 0.5 * torch.stack([right, down], -1)[same].cpu(), 2e-3)
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
+from builders import operation_cases
 from builders.operation_cases import gaussians, network_of, normal, points_between, uniform
 from kernels.compare import close
 
@@ -114,12 +115,7 @@ CASES = {
     ),
     "triplane": (
         _triplane,
-        {
-            "xy": normal(4, 5, 3),
-            "xz": normal(6, 5, 3, seed=9),
-            "yz": normal(6, 4, 3, seed=10),
-            "points": points_between(60, 60, 60, 60),
-        },
+        {name: operation_cases.CASES["triplane"].leaves[name] for name in ("xy", "xz", "yz", "points")},
         plain.triplane,
     ),
     "mlp": (_mlp, network_of(5, 17, 4, 2), plain.mlp),
@@ -160,9 +156,8 @@ def test_layers_and_arrays_without_a_gradient(device: str):
     grads = _on_tape(_layers, (60,), arguments, result, normal(60, seed=20))
     assert [*grads] == ["values"]
     leaf = torch.tensor(values[..., None], device=device).requires_grad_()
-    sampled = ops.plane(
-        leaf, torch.tensor(points, device=device), layer=torch.tensor(layer, device=device), periodic=True
-    )
+    points, layer = torch.tensor(points, device=device), torch.tensor(layer, device=device)
+    sampled = ops.plane(leaf, points, layer=layer, periodic=True)
     sampled[:, 0].backward(torch.tensor(normal(60, seed=20), device=device))
     close(result, sampled[:, 0], 1e-6)
     close(grads["values"], leaf.grad[..., 0], 1e-5)

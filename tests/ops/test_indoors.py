@@ -35,12 +35,8 @@ def test_viewers_stand_a_metre_above_a_rooms_floor():
 
 def test_the_height_of_the_eyes_is_a_share_where_the_unit_is_not_the_metre():
     position, triangle, _ = ROOM
-    for scale, metres, expected in (
-        (1, False, EYES_SHARE * 3),
-        (0.1, True, EYES_SHARE * 0.3),
-        (100, True, EYES_SHARE * 300),
-        (2, True, EYES),
-    ):
+    rooms = (1, False, EYES_SHARE * 3), (0.1, True, EYES_SHARE * 0.3), (100, True, EYES_SHARE * 300), (2, True, EYES)
+    for scale, metres, expected in rooms:
         there = indoors(position * scale, triangle, metres=metres)
         assert there.height == pytest.approx(expected) and len(there.eye) > 100
 

@@ -127,10 +127,7 @@ def test_what_is_refused(device: str):
         (lambda: ops.rasterize(clip, triangle, 0, 4), "height: expected 1 to 16384 pixels, got 0"),
         (lambda: ops.texture(image[:0], uv), r"image: expected at least one texel and one channel, got \(0, 2, 3\)"),
         (lambda: ops.rasterize(clip, triangle.to("meta"), 3, 4), "triangle: expected a tensor on .* meta"),
-        (
-            lambda: ops.interpolate(uv, triangle[:3], raster),
-            "triangle: expected the 32 triangles that were drawn, got 3",
-        ),
+        (lambda: ops.interpolate(uv, triangle[:3], raster), "triangle: expected the 32 triangles that were drawn"),
         (lambda: ops.texture(image, uv, filter="cubic"), "filter: expected linear or nearest, got 'cubic'"),
     ):
         with pytest.raises(ValueError, match=message):

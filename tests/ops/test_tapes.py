@@ -40,9 +40,8 @@ def _by_tape(subject: Subject, device: str, vectors: bool = True) -> tuple[list,
     with tape:
         values = subject.run(**leaves, **constants)
     assert len(tape.launches) == 1, "one function, and none of the launches inside"
-    adjoints = [
-        wp.array(normal(*v.numpy().shape, seed=20 + i), dtype=v.dtype, device=device) for i, v in enumerate(values)
-    ]
+    random = [normal(*v.numpy().shape, seed=20 + i) for i, v in enumerate(values)]
+    adjoints = [wp.array(each, dtype=v.dtype, device=device) for each, v in zip(random, values, strict=True)]
     tape.backward(grads={v: a for v, a in zip(values, adjoints, strict=True) if v.requires_grad})
     grads = {name: leaf.grad.numpy().reshape(subject.leaves[name].shape) for name, leaf in leaves.items()}
     return [v.numpy() for v in values], grads
@@ -94,9 +93,8 @@ def _chain(device: str) -> tuple[wp.Tape, wp.array, wp.array, wp.array]:
 def test_between_kernels(device: str):
     """Gradients pass from kernel to operation to kernel, of an array that is read twice; and they accumulate."""
     tape, values, points, loss = _chain(device)
-    torch_values, torch_points = (
-        wp.to_torch(a, requires_grad=False).clone().requires_grad_() for a in (values, points)
-    )
+    tensors = (wp.to_torch(a, requires_grad=False).clone().requires_grad_() for a in (values, points))
+    torch_values, torch_points = tensors
     again = ops.plane(torch_values, ops.plane(torch_values, 0.5 * torch_points), periodic=True)
     again.square().sum().backward()
     tape.backward(loss)

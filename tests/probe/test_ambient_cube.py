@@ -67,9 +67,7 @@ def test_what_is_read_is_written_again(tmp_path):
     assert (tmp_path / "a.ktx2").read_bytes() == (tmp_path / "b.ktx2").read_bytes()
     light[3, 0] = -1.0
     assert 0.0 < write_irradiance_volume(tmp_path / "c.ktx2", light, COUNT) <= 1.0
-    assert "expected irradiance of at most 65408" in error_of(
-        write_irradiance_volume, tmp_path / "d.ktx2", light * 1e6, COUNT
-    )
+    assert "irradiance of at most 65408" in error_of(write_irradiance_volume, tmp_path / "d.ktx2", light * 1e6, COUNT)
 
 
 def test_a_model_is_exported(tmp_path):

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 import warp as wp
-from builders.checks import error_of
+from builders.checks import error_of, misuse_of
 from builders.probe_models import EXTENT, ORIGIN, SIZE, random_model
 
 from benchmarks import probe_exact as exact
@@ -103,9 +103,8 @@ def test_the_models_own_probes(device):
     decoder = GaussianDecoder(model, device)
     decoded = decoder.decode_probes()
     assert decoded.shape == (200, 27) and (decoded[model.dead] == 0).all() and (decoded[~model.dead] != 0).any(1).all()
-    np.testing.assert_array_equal(
-        GaussianDecoder(model, device, position=model.stored_positions()).decode_probes(), decoded
-    )
+    decoder = GaussianDecoder(model, device, position=model.stored_positions())
+    np.testing.assert_array_equal(decoder.decode_probes(), decoded)
     # The order of the points on the device does not show in the result.
     turned = decoder.decode(model.stored_positions()[::-1])[::-1]
     np.testing.assert_array_equal(turned[~model.dead], decoded[~model.dead])
@@ -119,8 +118,7 @@ def test_wrong_positions():
     bad = np.zeros((4, 3))
     bad[2, 1] = np.nan
     assert "position 2: expected finite" in error_of(decoder.decode, bad)
-    with pytest.raises(ValueError, match=r"expected \[M, 3\]"):
-        decoder.decode(np.zeros(3))
+    assert "expected [M, 3]" in misuse_of(decoder.decode, np.zeros(3))
     assert "device 'cuda:9'" in error_of(GaussianDecoder, random_model(), "cuda:9")
     assert decoder.decode(np.zeros((0, 3))).shape == (0, 27)
 
@@ -131,9 +129,7 @@ def test_more_numbers_than_a_block_of_cuda_threads_can_hold():
     close(model.decoder("cpu").decode(position), model, position)
     most = most_outputs(9, 16)
     check_outputs("x", 9, 16, most, False, "cuda:0")
-    with pytest.raises(
-        WlmError, match=f"expected at most {most - 1} numbers a probe on CUDA with latent .* found 1501"
-    ):
+    with pytest.raises(WlmError, match=f"expected at most {most - 1} numbers a probe on CUDA with latent .* found 15"):
         check_outputs("x", 9, 16, 1501, True, "cuda:0")
 
 

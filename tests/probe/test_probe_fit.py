@@ -192,9 +192,8 @@ def test_a_bright_probe_costs_the_others_nothing():
 
 def referred(content, ambient=0):
     """The light of a content by the reference."""
-    return reference_decode(
-        content.cluster, content.code, content.bounds, content.basis, unit_of(content.basis), ambient
-    )
+    stored = (content.cluster, content.code, content.bounds, content.basis)
+    return reference_decode(*stored, unit_of(content.basis), ambient)
 
 
 @pytest.mark.parametrize("outputs", [1, 3, 5, 27])

@@ -84,11 +84,7 @@ def test_a_text_asset_of_unity(tmp_path, ending):
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        (
-            "LightProbes:",
-            "LightingDataAsset:",
-            "found LightingDataAsset, MonoBehaviour (the light of Adaptive Probe Volumes is in .bytes",
-        ),
+        ("LightProbes:", "LightingDataAsset:", "found LightingDataAsset, MonoBehaviour (the light of Adaptive Probe"),
         ("m_Positions", "m_Places", "m_Positions is missing"),
         ("sh[ 3]: ", "sh[ 3]: 0x", "the asset is damaged"),
         ("sh[ 3]", "sh[ 4]", "in this order"),

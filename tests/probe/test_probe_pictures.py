@@ -102,9 +102,8 @@ def test_the_gradient_is_that_of_both_errors(error: str, hours: int, device: str
         numbers = (trainer._gain * split[..., :-1] * split[..., -1:].exp()).reshape(70, -1)
         norms = values.view(70, hours, -1).norm(dim=2)
         scale = (norms.square() + (1e-4 * norms.log().mean(0).exp()).square()).sqrt()
-    dense, factors, value = (
-        torch.from_numpy(a) for a in (pixels.weights.toarray()[:, order], pixels.factors, pixels.slopes**2)
-    )
+    arrays = (pixels.weights.toarray()[:, order], pixels.factors, pixels.slopes**2)
+    dense, factors, value = map(torch.from_numpy, arrays)
     # Both errors weigh the same: the trace of the pictures' form in the network's numbers is that of the probes'.
     trace = torch.einsum("ptj,pv,vt,pc->", value.view(len(value), hours, 3), dense**2, scale**2, factors**2)
     seen = torch.einsum("pv,pc,vtcj->ptj", dense, factors, (numbers - values).view(70, hours, 9, 3))

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from builders.checks import error_of
 from builders.exported import read_export
 from builders.probe_models import EXTENT, ORIGIN, SIZE, random_model, with_content
 from builders.probe_sets import synthetic
@@ -134,15 +135,8 @@ def test_the_shader_depends_on_the_shape_alone():
 def test_what_is_written(tmp_path):
     model = random_model(positions=True, dead=4)
     paths = export(model, tmp_path)
-    assert [path.name for path in paths] == [
-        "gaussians.bin",
-        "network.bin",
-        "position.bin",
-        "positions.bin",
-        "probe.glsl",
-        "values.bin",
-        "bundle.json",
-    ]
+    names = "gaussians.bin network.bin position.bin positions.bin probe.glsl values.bin bundle.json"
+    assert [path.name for path in paths] == names.split()
     assert sorted(paths) == sorted(tmp_path.iterdir())
     info, arrays = read_export(tmp_path)
     assert (info["source"], info["probes"], info["gaussians"]) == (model.source, 200, 40)
@@ -167,9 +161,7 @@ def test_what_cannot_be_exported(tmp_path):
     for extent in (1e39, 1e-60):
         with pytest.raises(WlmError, match="random: cannot export: the probes' box is too"):
             export(replace(model, extent=extent), tmp_path / "new")
-    with pytest.raises(WlmError, match="device 'tpu'"):
-        export(model, tmp_path / "new", device="tpu")
+    assert "device 'tpu'" in error_of(export, model, tmp_path / "new", device="tpu")
     assert not (tmp_path / "new").exists()
     (tmp_path / "file").write_text("x")
-    with pytest.raises(WlmError, match="cannot write there"):
-        export(model, tmp_path / "file")
+    assert "cannot write there" in error_of(export, model, tmp_path / "file")

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from builders.checks import misuse_of
 from scipy.special import sph_harm_y
 
 from wlm.errors import WlmError
@@ -58,15 +59,11 @@ def test_which_numbers_are_bands():
 
 def test_wrong_use_is_refused():
     for wrong in (0, 2, 8, -1):
-        with pytest.raises(ValueError, match="whole bands"):
-            basis(unit(1), wrong)
+        assert "whole bands" in misuse_of(basis, unit(1), wrong)
     for wrong in (np.zeros((1, 3)), np.full((1, 3), np.nan), 2 * unit(1)):
-        with pytest.raises(ValueError, match="unit length"):
-            basis(wrong, 4)
-    with pytest.raises(ValueError, match=r"\[M, 3\]"):
-        basis(np.ones(3), 4)
-    with pytest.raises(ValueError, match=r"\[..., C, 3\]"):
-        irradiance(np.zeros(27), unit(1))
+        assert "unit length" in misuse_of(basis, wrong, 4)
+    assert "[M, 3]" in misuse_of(basis, np.ones(3), 4)
+    assert "[..., C, 3]" in misuse_of(irradiance, np.zeros(27), unit(1))
 
 
 def light(d):
@@ -228,5 +225,4 @@ def test_errors():
     with pytest.raises(WlmError, match="convention: expected threejs, godot, unreal, unity, got 'frostbite'"):
         to_canonical(np.ones((1, 9, 3)), "frostbite")
     for shape in ((9, 3), (1, 3, 9), (1, 9, 4)):
-        with pytest.raises(ValueError, match=r"\[N, C, 3\]"):
-            to_canonical(np.ones(shape), CANONICAL)
+        assert "[N, C, 3]" in misuse_of(to_canonical, np.ones(shape), CANONICAL)

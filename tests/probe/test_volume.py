@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from builders.checks import error_of
+from builders.checks import error_of, misuse_of
 from builders.exported import read_export
 from reference import volume as reference
 from reference import volume_blocks
@@ -207,9 +207,8 @@ def test_blocks_have_the_stated_light(device: str):
             room = 5e-4 * np.maximum(np.abs(low), np.abs(high)) + 1e-5
             assert (got > low - room).all() and (got < high + room).all()
     assert 0 < full < len(there) / 2
-    assert sum(s.probes for s in stats) == sum(
-        min(16, len(volume_blocks.near(position, tuple(block), volume.sizes[level]))) for level, *block in there
-    )
+    near = (len(volume_blocks.near(position, tuple(block), volume.sizes[level])) for level, *block in there)
+    assert sum(s.probes for s in stats) == sum(min(16, count) for count in near)
 
 
 def test_read_at_a_probe_is_that_probes_light(device: str):
@@ -246,8 +245,7 @@ def test_normals_keep_light_from_leaking(device: str):
     sets = [from_arrays(position, bright[:, None] + 0.1, normal=known) for known in (None, normal)]
     psnr = [score_volume(each, StoredLight(each.values, device), frames=2)["psnr"] for each in sets]
     assert psnr[1] > psnr[0] + 1.5
-    with pytest.raises(ValueError, match="normal"):
-        Volume(position, light, normal=normal[1:])
+    assert "normal" in misuse_of(Volume, position, light, normal=normal[1:])
 
 
 def test_any_way_leads_to_the_same_volume(device: str):
@@ -467,18 +465,14 @@ def test_wrong_settings(settings: dict):
 def test_wrong_arrays():
     position = _surface(10)
     for live in (np.ones(9, bool), np.ones(10), np.ones((10, 1), bool)):
-        with pytest.raises(ValueError, match="live"):
-            _volume(position, live=live)
-    with pytest.raises(ValueError, match="position: expected \\[10, 3\\]"):
-        Volume(position[1:], StoredLight(_field(position)))
+        assert "live" in misuse_of(_volume, position, live=live)
+    assert "position: expected [10, 3]" in misuse_of(Volume, position[1:], StoredLight(_field(position)))
     with pytest.raises(WlmError, match="probe 4: expected finite"):
         StoredLight(np.where(np.arange(10)[:, None] == 4, np.nan, _field(position)))
     volume = _volume(position)
-    with pytest.raises(ValueError, match="a call of `update` before"):
-        volume.read(position)
+    assert "a call of `update` before" in misuse_of(volume.read, position)
     volume.update([0.0, 0.0, 0.0])
-    with pytest.raises(ValueError, match="read"):
-        volume.read(position[0])
+    assert "read" in misuse_of(volume.read, position[0])
     assert volume.read(np.zeros((0, 3))).values.shape == (0, 5)
 
 
@@ -560,8 +554,7 @@ def test_camera_path_of_little():
     for position, frames in [(np.zeros((0, 3)), 5), (place, 0)]:
         assert "camera path: expected at least" in error_of(camera_path, position, frames)
     for position, up in [(place[0], 1), (place, 3)]:
-        with pytest.raises(ValueError, match="camera path"):
-            camera_path(position, 5, up=up)
+        assert "camera path" in misuse_of(camera_path, position, 5, up=up)
 
 
 def test_loop_at_a_pace():
@@ -621,10 +614,8 @@ def test_a_walk_where_no_probe_is():
 def test_walk_refuses():
     volume, light = _volume(_hills(50), side=16), _field(_hills(50))
     for path, options in [(np.zeros(3), {}), (np.zeros((0, 3)), {}), (_line(1, 0.0), {"samples": 0})]:
-        with pytest.raises(ValueError, match="walk: expected"):
-            walk(volume, path, light, **options)
-    with pytest.raises(ValueError, match="original"):
-        walk(volume, _line(1, 0.0), light[1:])
+        assert "walk: expected" in misuse_of(walk, volume, path, light, **options)
+    assert "original" in misuse_of(walk, volume, _line(1, 0.0), light[1:])
     assert "viewpoint" in error_of(walk, volume, np.array([[0.0, np.nan, 0.0]]), light)
 
 
@@ -682,6 +673,5 @@ def test_side_follows_the_spacing():
     assert len(BlockIndex(lattice, finest_side(lattice), (1,)).block) >= 2 * len(lattice)
     assert finest_side(np.zeros((0, 3))) == finest_side(np.ones((5, 3))) == 1.0
     for position in (np.array([[0, np.nan, 0]]), np.full((1, 3), 1e101)):
-        with pytest.raises(ValueError, match="position: expected probes"):
-            BlockIndex(position, 1.0, (1,))
+        assert "position: expected probes" in misuse_of(BlockIndex, position, 1.0, (1,))
     assert "positions: expected distances" in error_of(finest_side, np.array([[0.0, 0.0, 0.0], [1e300, 1e300, 1e300]]))

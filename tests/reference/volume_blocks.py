@@ -22,12 +22,8 @@ def around(place: np.ndarray, size: float) -> list[tuple[int, ...]]:
 
 def blocks(position: np.ndarray, size: float) -> set[tuple[int, ...]]:
     """Selects the blocks that have a tenth of the light at some probe."""
-    return {
-        block
-        for place in position
-        for block in around(place, size)
-        if hat(place / size - np.array(block) - 0.5) >= LEAST
-    }
+    near = ((place, block) for place in position for block in around(place, size))
+    return {block for place, block in near if hat(place / size - np.array(block) - 0.5) >= LEAST}
 
 
 def near(position: np.ndarray, block: tuple[int, ...], size: float) -> np.ndarray:

@@ -1,16 +1,19 @@
-"""Frames of a scene against a ray caster in float64, and a film in which a lamp is switched."""
+"""Frames of a scene against a ray caster in float64, a film with a lamp, and the street of the demos."""
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from builders import day_scenes
+from builders.checks import error_of
 from PIL import Image
 from scipy.ndimage import maximum_filter, minimum_filter
 
 import wlm
 from wlm.errors import WlmError
+from wlm.formats.light import read_light
 from wlm.interop import available_devices
 from wlm.scene import frame as frame_module
 from wlm.scene.frame import Renderer
@@ -78,14 +81,8 @@ def reference(scene, second, hour, factors=(1.0, 1.0), size=SIZE):
     floor, wall = parts[0] + parts[1]
     even = mixed(list(day_scenes.LIGHT), np.array(list(day_scenes.LIGHT.values())), hour)
     sky = mixed([0.0, 12.0], np.array([[0.0, 0.0, 0.1, 1.0], [0.5, 0.6, 0.8, -1.0]]), hour)
-    table = np.stack(
-        [
-            sky[:3],
-            day_scenes.FLOOR * floor / np.pi,
-            day_scenes.WALL * wall / np.pi,
-            np.multiply(day_scenes.SQUARE, even),
-        ]
-    )
+    lit = day_scenes.FLOOR * floor / np.pi, day_scenes.WALL * wall / np.pi, np.multiply(day_scenes.SQUARE, even)
+    table = np.stack([sky[:3], *lit])
     radiance = table[seen]
     radiance[smoke] = 0.2 * (puff.frame(second) + 1) * even + 0.5 * radiance[smoke]
     shown = 2.0 ** sky[3] * radiance
@@ -137,10 +134,7 @@ def test_a_camera_may_pass_above_its_target(changed):
 
 def test_the_smoke_of_a_folder_has_a_bound(scene, monkeypatch):
     monkeypatch.setattr(frame_module, "_SMOKE_BYTES", 2 * 8 * 8 * 8 * 2 - 1)
-    with pytest.raises(
-        WlmError, match="smoke: expected at most 0 MiB of six-way lightmaps, found 2 frames of 1024 bytes"
-    ):
-        Renderer(scene, 9, 16)
+    assert "smoke: expected at most 0 MiB of six-way lightmaps, found 2 frames of" in error_of(Renderer, scene, 9, 16)
 
 
 def test_an_original_is_shown_instead(renderer, scene):
@@ -211,3 +205,43 @@ def test_wrong_options_are_one_line_and_leave_nothing(scene, tmp_path, options, 
     with pytest.raises(WlmError, match=line):
         run(scene, tmp_path / "out", **{"frames": 1, "height": 16, "width": 16, "hours": []} | options)
     assert not any(tmp_path.iterdir())
+
+
+FOLDER = Path(__file__).resolve().parents[2] / "demos" / "data" / "street"
+MOST_BYTES = 6_000_000
+
+
+@pytest.fixture(scope="module")
+def street():
+    with wlm.scene.load(FOLDER / "street.yaml") as scene:
+        yield scene
+
+
+def test_no_file_is_missing_or_left_over(street):
+    files = {file for file in FOLDER.rglob("*") if file.is_file()}
+    used = {street.path, *street.originals.values(), FOLDER / "README.md"}
+    used |= {FOLDER / name for name in ("street.wlm", "probes.wlm", "street.glb", "car.glb", "van.glb")}
+    used |= {file for puff in street.smoke for file in puff.files}
+    assert files == used
+    assert len(street.probe_hours) == 10
+    assert sum(file.stat().st_size for file in files) <= MOST_BYTES
+
+
+@pytest.mark.parametrize("hour", [12.0, 22.0])
+def test_the_sum_of_the_groups_is_the_original(street, hour):
+    assert street.light.groups == ("sky", "sun")
+    mask = street.light.light.mask
+    original = read_light(street.originals[hour])[0][mask]
+    error = street.light.decoder().frame(hour)[mask] - original
+    assert np.sqrt(np.mean(error**2)) < 0.01 * np.ptp(original)
+
+
+def test_vehicles_stay_on_the_road(street):
+    """Roads are the lines x = 0, x = 3, z = 0 and z = 3, 0.66 m wide; a vehicle is at most 0.21 m wide."""
+    for moving in street.moving:
+        assert moving.mesh.position[:, 1].min() == pytest.approx(0.0, abs=1e-3)
+        assert np.ptp(moving.mesh.position[:, 0]) < 0.21
+        for second in np.linspace(0.0, moving.seconds, 50):
+            x, y, z = moving.pose(second)[:3, 3]
+            assert y == 0.0
+            assert min(abs(each - road) for each in (x, z) for road in (0.0, 3.0)) <= 0.33 - 0.105

@@ -21,13 +21,10 @@ from wlm.smoke.network.settings import DatasetSettings
 from wlm.smoke.scene import ObstacleSettings, obstacle_mesh
 from wlm_kernels.smoke.settings import March
 
-SMALL = DatasetSettings(
-    cells=16, refine=2, resolution=32, frames=2, views_a_frame=2, sequences=3, warmup=0.7, hot=0.4, moving=0.0
-)
-FEW = SMALL.model_copy(
-    update={"refine": 1, "sequences": 1, "frames": 1, "resolution": 24, "warmup": 0.6}
-    | {"validation_sequences": 1, "views": 4}
-)
+SMALL = DatasetSettings(cells=16, refine=2, resolution=32, frames=2, views_a_frame=2, sequences=3)
+SMALL = SMALL.model_copy(update={"warmup": 0.7, "hot": 0.4, "moving": 0.0})
+few = {"refine": 1, "sequences": 1, "frames": 1, "resolution": 24, "warmup": 0.6}
+FEW = SMALL.model_copy(update=few | {"validation_sequences": 1, "views": 4})
 NAMES = tuple(field.name for field in dataclasses.fields(Pool))
 
 
@@ -53,11 +50,8 @@ def test_storage_of_fine_grids():
     """Half floats are used except where they would round away the cooling in a short step."""
     fine = DatasetSettings(cells=256)
     smokes = [(scene.smoke, scene.step) for scene in (draw_scene(fine, 0, index) for index in range(60))]
-    assert {(smoke.hot, smoke.storage) for smoke, _ in smokes} == {
-        (False, "float16"),
-        (True, "float16"),
-        (True, "float32"),
-    }
+    kinds = {(smoke.hot, smoke.storage) for smoke, _ in smokes}
+    assert kinds == {(False, "float16"), (True, "float16"), (True, "float32")}
     for smoke, step in smokes:
         lost = 1.0 - np.exp(-smoke.cooling * step * smoke.substeps)
         assert smoke.storage == ("float32" if 0.0 < lost < LEAST_HALF_LOSS else "float16")

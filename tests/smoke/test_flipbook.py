@@ -1,4 +1,4 @@
-"""Flip books: every layout and kind of file, written and read, the order of cells, and wrong files."""
+"""Flip books: every layout and kind of file, the order of cells, wrong files, and mip levels that mix no frames."""
 
 import struct
 import zlib
@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from builders.checks import error_of
 from builders.smoke_plumes import unit_grid
 from PIL import Image
 
@@ -15,7 +16,7 @@ from wlm.fluid.volume import from_array
 from wlm.formats.exr import read_exr, write_exr, write_planes
 from wlm.smoke.camera import DIRECTIONS, LAYOUTS, Camera
 from wlm.smoke.data import is_six_way, read_shaded
-from wlm.smoke.flipbook.book import Book, Shot, pack_book, write_book
+from wlm.smoke.flipbook.book import Book, Shot, lay_out, mip_levels, mip_padding, pack_book, write_book
 from wlm.smoke.flipbook.naming import second_names
 from wlm.smoke.flipbook.reading import read_flipbook
 from wlm.smoke.lightmaps import SixWay, axis_faults
@@ -140,12 +141,8 @@ def test_the_gain_and_the_padding_are_read(tmp_path: Path):
         assert float(raw[0].lightmaps.max()) > 4.9 * float(frames[0].lightmaps.max())
 
 
-LAYERED = {
-    "channels": "{0}",
-    "layers": "C_{0}.R C_{0}.G C_{0}.B",
-    "short": "light{1}.R light{1}.G light{1}.B",
-    "pair": "",
-}
+LAYERED = {"channels": "{0}", "layers": "C_{0}.R C_{0}.G C_{0}.B", "pair": ""}
+LAYERED["short"] = "light{1}.R light{1}.G light{1}.B"
 
 
 @pytest.mark.parametrize("kind", LAYERED)
@@ -168,8 +165,7 @@ def test_layers_of_one_file(tmp_path: Path, kind: str):
     np.testing.assert_allclose(six.transparency, frame.transparency, atol=6e-4)
     write_planes(path, planes | {"N_left": planes["A"]})
     if kind != "pair":
-        with pytest.raises(WlmError, match="expected one layer for left, found "):
-            read_shaded(path)
+        assert "expected one layer for left, found " in error_of(read_shaded, path)
 
 
 def test_names_of_pairs():
@@ -197,8 +193,7 @@ def test_straight_alpha_in_a_third_texture(tmp_path: Path):
     with pytest.raises(WlmError, match="expected an alpha channel or a texture of opacity for straight alpha"):
         read_flipbook([*paths], "unity", rows=1, columns=2, straight=True)
     Image.new("L", (8, 8)).save(book[2])
-    with pytest.raises(WlmError, match="expected textures of one size"):
-        read_flipbook(book, "unity", rows=1, columns=2)
+    assert "expected textures of one size" in error_of(read_flipbook, book, "unity", rows=1, columns=2)
 
 
 def test_wrong_files(tmp_path: Path):
@@ -228,3 +223,34 @@ def test_wrong_files(tmp_path: Path):
     with pytest.raises(WlmError, match="a_1.png: cannot write: expected finite light"):
         write_book(_book([SixWay(torch.full((6, 2, 2), torch.nan), None)]), tmp_path / "a.png")
     assert Image.open(paths[0]).size == (9, 6)
+
+
+@pytest.mark.parametrize(("height", "width", "levels"), [(24, 40, 3), (16, 16, 1), (50, 30, 2)])
+def test_smaller_textures_show_no_neighbours(height: int, width: int, levels: int):
+    """Mip levels within a frame do not depend on the neighbouring frames."""
+    padding = mip_padding(height, width, levels)
+    assert mip_levels(height, width, padding) >= levels
+    random = np.random.default_rng(3)
+    frame = random.random((height, width, 1), np.float32)
+
+    def shown(neighbours: float, level: int) -> torch.Tensor:
+        cells = np.full((9, height, width, 1), neighbours, np.float32)
+        cells[4] = frame
+        page = torch.from_numpy(lay_out(cells, 3, 3, padding))[None].permute(0, 3, 1, 2)
+        # As engines make them, one from the other.
+        for _ in range(level):
+            page = torch.nn.functional.avg_pool2d(page, 2)
+        edges = [(n + padding) / (n + 2 * padding) for n in (height, width)]
+        axes = [torch.linspace(1 + 1 - edge, 1 + edge, 60) / 3 for edge in edges]
+        grid = torch.stack(torch.meshgrid(*axes, indexing="ij")[::-1], -1)[None]
+        return torch.nn.functional.grid_sample(page, 2 * grid - 1, align_corners=False, padding_mode="border")
+
+    for level in range(levels + 1):
+        assert torch.equal(shown(0.0, level), shown(1000.0, level))
+    assert not torch.equal(shown(0.0, levels + 2), shown(1000.0, levels + 2))
+
+
+def test_what_no_padding_helps():
+    with pytest.raises(WlmError, match="mips: 3 levels need .* a multiple of 8 pixels, .* frames of 33 x 32 pixels"):
+        mip_padding(32, 33, 3)
+    assert mip_levels(33, 32, 16) == 0 and mip_levels(32, 32, 0) == 0

@@ -14,9 +14,8 @@ def _ball(device: str, n: int = 32, voxel: float = 0.5, extinction: float = 0.4)
     """Makes a soft ball with a bump, away from the world's origin."""
     x, y, z = unit_grid(n)
     density = np.clip(1.6 - 2 * np.sqrt(x**2 + y**2 + z**2), 0, 1) * (1 + 0.5 * np.sin(5 * x) * np.cos(4 * y))
-    return from_array(
-        density.astype(np.float32), extinction=extinction, voxel=voxel, origin=(10.0, -3.0, 5.0), device=device
-    )
+    place = (10.0, -3.0, 5.0)
+    return from_array(density.astype(np.float32), extinction=extinction, voxel=voxel, origin=place, device=device)
 
 
 def _camera(volume: DensityVolume, way: tuple = (0.3, 0.4, 1.0), distance: float = 30.0, **options) -> Camera:
@@ -49,9 +48,8 @@ def test_depth_is_in_the_world(device: str, perspective: bool):
 def test_distance_of_an_orthographic_camera(device: str):
     """The distance changes only the depths, by the same amount, also from very far away."""
     volume = _ball(device)
-    near, far = (
-        guide(volume, _camera(volume, distance=distance), March(1.0, jitter=0.0)) for distance in (30.0, 30_000.0)
-    )
+    cameras = (_camera(volume, distance=distance) for distance in (30.0, 30_000.0))
+    near, far = (guide(volume, camera, March(1.0, jitter=0.0)) for camera in cameras)
     np.testing.assert_allclose(far.maps[:2].cpu(), near.maps[:2].cpu(), atol=1e-3)
     hit = (near.depth > 0) & (far.depth > 0)
     np.testing.assert_allclose((far.depth - near.depth)[hit].cpu(), 29_970.0, atol=0.3)

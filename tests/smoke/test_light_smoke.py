@@ -99,9 +99,8 @@ def test_the_whole_picture_is_the_tracers(device: str):
     traced = trace(volume, camera, lights, albedo=(0.9, 0.6, 0.3), samples=4096, highest=1)
     # Emission that is scattered isn't in the march.
     wanted = traced.planes[:2].sum((0, 1)) + traced.planes[2, 0]
-    wanted = wanted + bake(volume, camera, step=0.25).transparency[..., None] * torch.tensor(
-        [0.2, 0.2, 0.5], device=device
-    )
+    clear = bake(volume, camera, step=0.25).transparency[..., None]
+    wanted = wanted + clear * torch.tensor([0.2, 0.2, 0.5], device=device)
     assert abs(float(made.mean() / wanted.mean()) - 1) < 0.005
     assert rms(made, wanted) < 0.02
 

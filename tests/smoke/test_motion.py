@@ -49,10 +49,8 @@ def test_uniform_motion(device: str, way: tuple):
         assert (plane[opacity == 0] == 0).all() and smoke.any() and not smoke.all()
     # What the smoke has left behind has no motion: it shows none any more.
     earlier = 1.0 - bake(before, camera, estimate=False).transparency
-    error, still = (
-        float((picture - opacity.cpu())[smoke.cpu()].square().mean())
-        for picture in (_warped(earlier, moved), earlier.cpu())
-    )
+    pictures = (_warped(earlier, moved), earlier.cpu())
+    error, still = (float((each - opacity.cpu())[smoke.cpu()].square().mean()) for each in pictures)
     assert error < 0.02 * still
 
 

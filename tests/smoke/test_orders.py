@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from builders.checks import error_of
 from builders.smoke_plumes import plume
 
 from benchmarks.smoke import make_cloud
@@ -22,7 +23,6 @@ from benchmarks.smoke_learning import (
 )
 from benchmarks.smoke_tracing import trace
 from demos.plume import make_plume
-from wlm.errors import WlmError
 from wlm.fluid.volume import DensityVolume
 from wlm.smoke.camera import Camera
 from wlm.smoke.shading import Light, PointLight
@@ -65,9 +65,8 @@ def test_the_mix_is_worth_its_name_and_never_worse(lessons):
         for lesson in lessons:
             for albedo in (0.8, 1.0):
                 light = lesson.light[ALBEDOS.index(albedo)]
-                found.append(
-                    psnr(mixed(model, lesson.inputs, albedo), light) - psnr(diffused(lesson.inputs, albedo), light)
-                )
+                one, other = mixed(model, lesson.inputs, albedo), diffused(lesson.inputs, albedo)
+                found.append(psnr(one, light) - psnr(other, light))
         return min(found) > 0.0 and np.mean(found) > 2.0
 
     assert holds(model)
@@ -229,5 +228,4 @@ def test_files_of_models(tmp_path):
     again = load_orders(tmp_path / "a.npz")
     assert torch.equal(model.weights, again.weights) and torch.equal(model.known, again.known)
     np.savez(tmp_path / "b.npz", weights=model.weights.numpy())
-    with pytest.raises(WlmError, match="range is missing"):
-        load_orders(tmp_path / "b.npz")
+    assert "range is missing" in error_of(load_orders, tmp_path / "b.npz")

@@ -17,9 +17,8 @@ from wlm.smoke.network.dataset import make_validation
 from wlm.smoke.network.planes import OPACITY_PLANE
 from wlm.smoke.network.settings import DatasetSettings
 
-FEW = DatasetSettings(
-    cells=16, refine=2, resolution=16, frames=1, views=2, warmup=0.6, hot=0.0, validation_sequences=1, moving=0.0
-)
+FEW = DatasetSettings(cells=16, refine=2, resolution=16, frames=1, views=2, warmup=0.6, hot=0.0, validation_sequences=1)
+FEW = FEW.model_copy(update={"moving": 0.0})
 
 
 def _network(seed: int = 0, **settings) -> SmokeModel:

@@ -1,4 +1,4 @@
-"""Pictures of smoke: what is drawn where, before and behind the smoke, and in which cell of a sheet."""
+"""Pictures of light and smoke: what is drawn where, before and behind the smoke, and in which cell of a sheet."""
 
 import math
 from dataclasses import replace
@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from builders.checks import misuse_of
 from builders.smoke_plumes import facing, plume, rays
 from PIL import Image
 from reference.marching import Scene, depth_to, samples
@@ -16,7 +17,8 @@ from wlm.smoke.scene import CameraSettings, LightSettings, ObstacleSettings, mak
 from wlm.smoke.shading import Light, PointLight, Ramp
 from wlm.smoke.transport.lighting import light_smoke
 from wlm.smoke.transport.orders import scatter
-from wlm.view.pictures import contact_sheet, to_bytes
+from wlm.view.display import white_of
+from wlm.view.pictures import contact_sheet, encode, to_bytes
 from wlm.view.smoke import Drawing, picture
 from wlm_kernels.smoke.settings import March
 
@@ -172,8 +174,7 @@ def test_smoke_under_its_own_lights_is_drawn_as_it_shades(device, orders):
         assert smoke.lit.thrown.any()
     albedo = {"albedo": (0.9, 0.5, 0.0)} if orders == "single" else {}
     torch.testing.assert_close(drawn, smoke.shade(**looks, **albedo))
-    with pytest.raises(ValueError, match="among obstacles"):
-        picture(smoke, obstacles=[_ball(0.1, 0.6, 0.25)])
+    assert "among obstacles" in misuse_of(picture, smoke, obstacles=[_ball(0.1, 0.6, 0.25)])
 
 
 @pytest.mark.parametrize("perspective", [False, True])
@@ -228,3 +229,16 @@ def test_lightmaps_are_lit_from_directions_alone():
     camera = _camera(8)
     half = picture(_flat(camera, 0.5, 0.4), [FRONT], albedo=(0.5, 1.0, 0.0))
     torch.testing.assert_close(half, picture(_flat(camera, 0.5, 0.4), [FRONT]) * torch.tensor([0.5, 1.0, 0.0]))
+
+
+def test_exposure():
+    light = np.array([[[0.0, 0.5, 1.0], [2.0, -1.0, 0.001]]])
+    encoded = encode(light, np.array([[True, True]]), 1.0)
+    # sRGB of a half is 188, of a thousandth 12.92 / 1000.
+    np.testing.assert_array_equal(encoded, [[[0, 188, 255], [255, 0, 3]]])
+    assert (encode(light, np.zeros((1, 2), bool), 1.0) == 128).all()
+    assert white_of(np.zeros((5, 3))) == 1.0 == white_of(np.zeros((0, 3)))
+    dark = np.zeros((10000, 3))
+    dark[0] = 3.0
+    assert white_of(dark) == 3.0, "one lamp in the dark"
+    assert white_of(np.arange(1001.0)) == pytest.approx(995.0)

@@ -243,23 +243,13 @@ def lost_light(model: LightmapModel, lightmaps: LightmapSet, device: str = "cpu"
 
 
 def _lost_light(model: SheetModel, lightmaps: SheetFrames, device: str) -> list[str]:
-    mask, lost, times = scored_mask(model, lightmaps), LostLight(), range(len(model.times))
-
-    def doubtful(i: int) -> list[tuple[int, tuple[slice, slice]]]:
-        inside, frame = mask & lightmaps.valid(i), lightmaps.frames[i]
-        return [at for at in _windows(model) if _may_hide_loss(frame[at[1]], inside[at[1]])]
-
-    chosen = list(each(doubtful, times))
-    if not any(chosen):
-        return []
-    decoder = SheetDecoder(model, device)
-    # Loads the kernel of each kind of tile: threads must not do it at once.
-    decoder.tiles(np.unique(model.kind, return_index=True)[1], model.times[0])
+    mask, lost, decoder = scored_mask(model, lightmaps), LostLight(), SheetDecoder(model, device)
 
     def look(i: int) -> LostLight:
         own, frame, inside, stamp = LostLight(), lightmaps.frames[i], mask & lightmaps.valid(i), model.times[i]
-        for start in range(0, len(chosen[i]), _TILES_AT_ONCE):
-            some = chosen[i][start : start + _TILES_AT_ONCE]
+        doubtful = [at for at in _windows(model) if _may_hide_loss(frame[at[1]], inside[at[1]])]
+        for start in range(0, len(doubtful), _TILES_AT_ONCE):
+            some = doubtful[start : start + _TILES_AT_ONCE]
             for (tile, window), decoded in zip(some, decoder.tiles([tile for tile, _ in some], stamp), strict=True):
                 part = frame[window]
                 both = part, decoded[: part.shape[0], : part.shape[1]]
@@ -268,8 +258,10 @@ def _lost_light(model: SheetModel, lightmaps: SheetFrames, device: str) -> list[
                 own.add(*(texels.reshape(-1, 3).take(valid, 0) for texels in both), _place(tile, stamp))
         return own
 
+    # Loads the kernel of each kind of tile: threads must not do it at once.
+    decoder.tiles(np.unique(model.kind, return_index=True)[1], model.times[0])
     with interop.one_thread():
-        for own in each(look, times):
+        for own in each(look, range(len(model.times))):
             lost.merge(own)
     return lost.warnings(model.name, *_LOST)
 

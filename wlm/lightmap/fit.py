@@ -182,7 +182,7 @@ class _Facts:
 class SheetFit:
     """The tiles of a sheet to be fitted, by rising number, int [N], with their kinds, and the model that receives their
     maps and networks; those of batches that are not stored yet are still missing. `warning` is a setting that could not
-    be followed, or None.
+    be followed, or None; `whole_batches` is the number of dynamic tiles over that of the largest batch.
 
     Tiles are cut out of the sheet as they are needed, a few at a time: all tiles of a large set do not fit in memory.
     """
@@ -227,6 +227,8 @@ class SheetFit:
             **arrays,
         )
         self._dynamic = np.flatnonzero(self.kinds == TileKind.DYNAMIC)
+        self._largest = max(1, BATCH_TEXELS // (times * TILE * TILE))
+        self.whole_batches = len(self._dynamic) / self._largest
         for i, row in enumerate(self._dynamic):
             fact = facts[row]
             self.model.scale[i], self.model.peak[i], self.model.affine[i] = fact.scale, fact.peak, fact.affine
@@ -239,15 +241,6 @@ class SheetFit:
             self.model.frames[i], self.model.ranges[i] = encode_frames(tile.colour[0], tile.mask[0])
             if meter.due(i + 1):
                 meter.report(i + 1)
-
-    @property
-    def _largest(self) -> int:
-        return max(1, BATCH_TEXELS // (len(self.model.times) * TILE * TILE))
-
-    @property
-    def whole_batches(self) -> float:
-        """How many of the largest batches the dynamic tiles are."""
-        return len(self._dynamic) / self._largest
 
     def batches(self, first: int, share: float = 1.0, most: int | None = None) -> list[Batch]:
         """Splits the dynamic tiles into batches, numbered from `first`: equal ones of about a share of the largest

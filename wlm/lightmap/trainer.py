@@ -150,6 +150,7 @@ class Trainer:
         self.steps, self.frozen = profile.steps, round(profile.freeze_from * profile.steps)
         self._quantised_from = round(profile.quantise_from * profile.steps)
         self._samples, self._integers, self._name = profile.samples, profile.net_bits == 8, profile.name
+        self._turned = profile.hidden if profile.muon else 0
         self._first_rates, self._decay = (profile.map_rate, profile.net_rate), profile.adam_decay
         self.numbers, self.tiles = targets.number, len(targets.number)
         n, r, slices = self.tiles, profile.uvt_resolution, profile.uvt_slices
@@ -163,7 +164,7 @@ class Trainer:
         with interop.alone:
             self._kernels = lightmap_step.step_kernels(profile.hidden, profile.gelu, "cuda" if self._cuda else "cpu")
             self._kernels.load(device)
-            wp.load_module(gather, device)
+            gather.load(device, self._turned)
         with interop.stream(device):
             self._allocate(shapes, profile)
             self._upload(targets, seed, profile.gamma)
@@ -231,6 +232,7 @@ class Trainer:
         self._levels_args = tuple(wrap(values) for values in (*nets, *self._on_levels))
         self._launch_sums = (wrap(self._acc), *shaped)
         self._update_args: list = [self._wrapped_rates, self._launch_sums[0], adams[0], self._maps[0]]
+        self._turned_args = adams[1].first, wrap(self.hidden.view(-1))
         for sums, moments, values in zip((self._partial, self._partial_out), adams[1:], nets, strict=True):
             self._update_args += [wrap(sums.view(parts, -1)), moments, wrap(values.view(-1))]
         self._update_args += [wrap(self._loss_parts), wrap(self.loss), wrap(self.control), self._maps[1].values]
@@ -352,7 +354,10 @@ class Trainer:
 
     def _update(self, stage: int) -> None:
         options = {"frozen": stage == 2, "levels": stage == 1, "clear": not self._cuda, "lanes": self._lanes}
+        options["turned"] = self._turned
         self._share(lambda lane: gather.update(*self._update_args, **options, lane=lane))
+        if self._turned:
+            gather.turn(self._turned, self._wrapped_rates, *self._turned_args)
 
     def _share(self, work: Callable[[int], None]) -> None:
         """Runs `work(i)` for each lane i, each in its own thread; kernel launches release Python's lock."""

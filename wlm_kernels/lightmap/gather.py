@@ -3,15 +3,20 @@
 Read `tests/kernels/test_optimiser.py` first; it compares the updates with those of torch's Adam.
 """
 
+import functools
 from typing import Any
 
 import warp as wp
 
 from wlm_kernels.lightmap.blocks import over_255, ste_endpoint, ste_weight
-from wlm_kernels.lightmap.features import Maps, four_at
-from wlm_kernels.native import native_source
+from wlm_kernels.lightmap.features import INPUTS, Maps, four_at
+from wlm_kernels.native import native_source, on_cuda
 
 wp.set_module_options({"enable_backward": False})
+
+# Muon changes each singular value x of a momentum to A x + B x^3 + C x^5, five times.
+_MUON = "constexpr float A = 3.4445f, B = -4.775f, C = 2.0315f;\n"
+_MUON_SHARE = 0.2  # root mean square of a move over the rate, about that of Adam's
 
 
 @wp.func
@@ -102,6 +107,7 @@ def _update(
     levels: int,
     base: int,
     clear: int,
+    turned: int,
     rates: wp.array1d[wp.vec4],
     # in and out:
     acc: wp.array2d[Any],
@@ -126,7 +132,10 @@ def _update(
     if t == 0:
         control[0] = control[0] + 1
     if t < hidden.shape[0]:
-        _move(hidden, adam_hidden, t, _drain(partial, t, clear), now[1], corrections)
+        row = t // wp.max(turned, 1) % (INPUTS + 2 + turned)
+        bias = row == INPUTS or row == INPUTS + 1 + turned
+        rate = wp.where(turned == 0 or bias, now[1], 0.0)
+        _move(hidden, adam_hidden, t, _drain(partial, t, clear), rate, corrections)
         return
     t -= hidden.shape[0]
     if t < output.shape[0]:
@@ -161,7 +170,13 @@ for _scalar in (float, wp.int64):
 
 
 def update(
-    *arguments: Any, frozen: bool = False, levels: bool = False, clear: bool, lane: int = 0, lanes: int = 1
+    *arguments: Any,
+    frozen: bool = False,
+    levels: bool = False,
+    clear: bool,
+    turned: int = 0,
+    lane: int = 0,
+    lanes: int = 1,
 ) -> None:
     """Converts sums into gradients, updates the parameters with Adam and running means of losses, and counts the step.
 
@@ -169,15 +184,52 @@ def update(
         arguments: Those of `_update` in its order. Sums are as `StepKernels.launch` adds them, those of maps are set to
             0; `maps` are updated and clamped to [0, 1]; `rounded` gets their levels in the file.
         frozen, levels, clear: Whether only networks are updated, `rounded` is written, networks' sums are set to 0.
+        turned: H if `turn` moves the weights of the hidden layers, of which only moments are updated here, else 0.
         lane, lanes: This launch updates one of so many parts of all parameters.
     """
     maps, hidden, output, mean_loss = (arguments[i] for i in (3, 6, 9, 11))
     total = hidden.shape[0] + output.shape[0] + mean_loss.shape[0] + (0 if frozen else maps.values.shape[0] // 4)
     first, last = (min(total, each * -(-total // lanes)) for each in (lane, lane + 1))
-    wp.launch(_update, last - first, inputs=[int(levels), first, int(clear), *arguments], device=hidden.device)
+    wp.launch(_update, last - first, inputs=[int(levels), first, int(clear), turned, *arguments], device=hidden.device)
 
 
 def put_on_levels(maps: Maps, rounded: Maps) -> None:
     """Writes the levels of the file that are nearest to `maps.values` to `rounded.values`."""
     values = maps.values
     wp.launch(_put_levels, values.shape[0] // 4, inputs=[maps], outputs=[rounded.values], device=values.device)
+
+
+@functools.cache
+def _turn_kernel(width: int, threads: int) -> Any:
+    cuda = native_source(__package__, "orthogonal", H=width, T=threads)
+    cuda = native_source("wlm_kernels", "matrix_units") + _MUON + cuda
+    cpu = _MUON + native_source(__package__, "orthogonal_cpu", H=width, I=INPUTS)
+
+    @wp.func_native(on_cuda(cuda, cpu))
+    def move(momentum: wp.array1d[float], at: int, rows: int, rate: float, weights: wp.array1d[float]): ...
+
+    @wp.kernel(module="unique", module_options={"enable_backward": False})
+    def turn(rates: wp.array1d[wp.vec4], momentum: wp.array1d[float], weights: wp.array1d[float]):
+        n, layer, _thread = wp.tid()
+        rows = wp.where(layer == 0, INPUTS, width)
+        at = (n * wp.static(INPUTS + 2 + width) + layer * wp.static(INPUTS + 1)) * width
+        size = wp.sqrt(float(wp.max(rows, width)))
+        move(momentum, at, rows, rates[0][1] * wp.static(_MUON_SHARE) * size, weights)
+
+    return turn
+
+
+def load(device: str, turned: int) -> None:
+    """Compiles `update` for a device, and `turn` of a width, unless it is 0; the first launch would do so otherwise."""
+    wp.load_module(_update.module, device)
+    if turned:
+        threads = 1 if device == "cpu" else turned * turned // 8
+        wp.load_module(_turn_kernel(turned, threads).module, device, block_dim=threads)
+
+
+def turn(width: int, rates: wp.array, momentum: wp.array, weights: wp.array) -> None:
+    """Moves the weights of networks' hidden layers of a width H, float [N (18 + H) H] as in `wlm_kernels.mlp`, with
+    Muon: along their momentum made orthogonal (Jordan et al., 2024), at the rate `rates[0][1]`. Biases stay."""
+    threads = width * width // 8 if weights.device.is_cuda else 1
+    shape, kernel = (weights.shape[0] // ((INPUTS + 2 + width) * width), 2, threads), _turn_kernel(width, threads)
+    wp.launch(kernel, shape, inputs=[rates, momentum, weights], device=weights.device, block_dim=threads)

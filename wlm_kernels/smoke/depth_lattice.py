@@ -119,9 +119,8 @@ def _gaps(gaps: wp.array4d[wp.float16], start: int, step: int, n: int, end: int)
     several = _Several()
     for m in range(_AT_ONCE):
         # The load has no branch, so that all loads are issued at once.
-        several[m] = _gap(gaps, start + step * wp.max(wp.min(n + m, end - 1), 0))
-    for m in range(_AT_ONCE):
-        several[m] = wp.where(n + m < end, several[m], 0.0)
+        gap = _gap(gaps, start + step * wp.max(wp.min(n + m, end - 1), 0))
+        several[m] = wp.where(n + m < end, gap, 0.0)
     return several
 
 

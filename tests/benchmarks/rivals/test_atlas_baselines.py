@@ -31,12 +31,8 @@ def _read(rival, mesh):
     y, x = np.mgrid[:height, :width] + 0.5
     uv = torch.tensor(np.stack([x / width, y / height], -1).reshape(-1, 2), dtype=torch.float32)
     none = torch.zeros(len(uv), dtype=torch.int32)
-    return (
-        rival.decoded(Points(uv, none, none.long(), torch.zeros(len(uv), 3)), 0)
-        .numpy()
-        .astype(np.float64)
-        .reshape(height, width, 3)
-    )
+    light = rival.decoded(Points(uv, none, none.long(), torch.zeros(len(uv), 3)), 0)
+    return light.numpy().astype(np.float64).reshape(height, width, 3)
 
 
 @pytest.mark.parametrize("name", RIVALS)
@@ -77,11 +73,8 @@ def test_halves_by_hand():
     line = np.array([[1.0, 3.0, 4.0, 8.0, 9.0, 5.0]])
     image = np.repeat(np.repeat(line, 2, 0)[..., None], 3, 2)
     mask = np.ones((2, 6), bool)
-    for size, expected in (
-        ((1, 3), [2.0, 6.0, 7.0]),
-        ((1, 2), [8 / 3, 22 / 3]),
-        ((2, 4), [5 / 3, 11 / 3, 25 / 3, 19 / 3]),
-    ):
+    halves = ((1, 3), [2.0, 6.0, 7.0]), ((1, 2), [8 / 3, 22 / 3]), ((2, 4), [5 / 3, 11 / 3, 25 / 3, 19 / 3])
+    for size, expected in halves:
         np.testing.assert_allclose(small(image, mask, *size, "box")[0, :, 0], expected)
 
 

@@ -26,10 +26,10 @@ def _check(decoder: TileDecoder, model: SheetModel, time: float, most: float) ->
         assert (np.abs(found - light) <= allowed).all()
 
 
-@pytest.mark.parametrize(
-    ("hidden", "gelu"),
-    [(8, "tanh"), *(pytest.param(*shape, marks=pytest.mark.slow) for shape in ((17, "exact"), (64, "tanh")))],
-)
+SLOW = [pytest.param(*shape, marks=pytest.mark.slow) for shape in ((17, "exact"), (64, "tanh"))]
+
+
+@pytest.mark.parametrize("hidden, gelu", [(8, "tanh"), *SLOW])
 def test_tiles_decode_at_any_time(device, hidden, gelu):
     model = random_sheet(KINDS, hidden=hidden, gelu=gelu)
     exact, frames = ExactDecoder(model, device), FrameDecoder(model, device)

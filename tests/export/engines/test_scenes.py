@@ -109,16 +109,13 @@ def test_the_shader_alone_reads_each_objects_part(state, each_form, tmp_path):
     picture = np.zeros((SIZE, SIZE, 3))
     for (x, y, width, height), place, sheet in squares(info):
         uv = f"(vec2(pixel) + 0.5) / vec2({width}.0, {height}.0)"
-        main = (
-            f"light = vec4(wlm_object({uv}, vec4({', '.join(map(repr, map(float, place)))}), {sheet}, {state}), 1.0);"
-        )
+        numbers = ", ".join(map(repr, map(float, place)))
+        main = f"light = vec4(wlm_object({uv}, vec4({numbers}), {sheet}, {state}), 1.0);"
         picture[y : y + height, x : x + width] = run_glsl(text, main, (height, width), bound)[..., :3]
     check(picture, model, state)
 
 
-@pytest.mark.parametrize(
-    "state", [pytest.param(0.0, marks=pytest.mark.slow), 1.5, pytest.param(2.0, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("state", [1.5, *(pytest.param(state, marks=pytest.mark.slow) for state in (0.0, 2.0))])
 def test_unreals_node_reads_each_objects_part(state, each_form, tmp_path, monkeypatch):
     model = each_form
     export(model, tmp_path, "unreal")

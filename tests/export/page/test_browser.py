@@ -232,10 +232,8 @@ def test_a_texel_of_an_atlas(kind, tmp_path, show):
 
 
 def test_materials_dim_the_light_of_an_atlas(tmp_path, show):
-    mesh, pixels = (
-        atlas_meshes.sheet(atlas_meshes.constant(0.5, 0.4, 0.3)),
-        np.full((16, 16, 3), [255, 128, 0], np.uint8),
-    )
+    mesh = atlas_meshes.sheet(atlas_meshes.constant(0.5, 0.4, 0.3))
+    pixels = np.full((16, 16, 3), [255, 128, 0], np.uint8)
     pixels[:, 8:] = 64
     data = io.BytesIO()
     Image.fromarray(pixels).save(data, "PNG")

@@ -1,10 +1,12 @@
-"""Pages: what they carry, and what a page can't be made of."""
+"""Pages: what they carry, what a page can't be made of, and those of three.js that tutorials print, in Chromium."""
 
 import base64
 import dataclasses
 import hashlib
+import io
 import json
 import re
+import shlex
 import zlib
 
 import numpy as np
@@ -12,10 +14,14 @@ import pytest
 import torch
 import yaml
 from builders import atlas_meshes, day_scenes, probe_models, small_sets
+from builders.checks import error_of
 from builders.contract import FILES
+from builders.running import call
+from PIL import Image
 from typer.testing import CliRunner
 
 import wlm
+from demos.tutorials import ROOT, steps
 from wlm.cli.app import app
 from wlm.errors import WlmError
 from wlm.export.page.html import Page
@@ -146,8 +152,7 @@ def test_frames_of_smoke_are_of_one_size(tmp_path):
         write_six_way(tmp_path / f"{name}.exr", SixWay(planes[:6], planes[6], camera=camera))
     with pytest.raises(WlmError, match="expected 8x8 pixels as the first frame, found 4x4"):
         make_page([tmp_path / "a_1.exr", tmp_path / "a_2.exr"])
-    with pytest.raises(WlmError, match="--rate"):
-        make_page([tmp_path / "a_1.exr"], rate=0.0)
+    assert "--rate" in error_of(make_page, [tmp_path / "a_1.exr"], rate=0.0)
     assert make_page([tmp_path / "a_1.exr"]).title == "a_1"
     (tmp_path / "a_2.exr").write_bytes((tmp_path / "a_1.exr").read_bytes())
     folder, files = make_page([tmp_path]), make_page([tmp_path / "a_1.exr", tmp_path / "a_2.exr"])
@@ -209,8 +214,7 @@ def test_what_a_scene_lacks_is_said_in_one_line(room, tmp_path):
         with pytest.raises(WlmError, match=re.escape(said)) as caught:
             write_page(tmp_path / "page.html", [path])
         assert "\n" not in str(caught.value) and not (tmp_path / "page.html").exists()
-    with pytest.raises(WlmError, match="--mesh has no meaning"):
-        make_page([room], mesh=room.with_name("room.glb"))
+    assert "--mesh has no meaning" in error_of(make_page, [room], mesh=room.with_name("room.glb"))
 
 
 def test_the_command_writes_a_page_of_a_folder(tmp_path):
@@ -230,3 +234,26 @@ def test_the_command_without_files_writes_a_viewer(tmp_path):
     result = CliRunner().invoke(app, ["web", "-o", str(tmp_path / "viewer.html")])
     assert result.exit_code == 0, result.output
     assert parts(tmp_path / "viewer.html")[0]["kind"] == "viewer"
+
+
+NEEDED = {
+    "bake": ("wlm compress demos/data/cornell", "wlm export room.wlm -o room-three"),
+    "smoke": ("wlm smoke simulate", "wlm smoke bake", "wlm smoke flipbook six -o puff-three"),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NEEDED)
+def test_the_page_shows_light(name, tmp_path, monkeypatch, visit):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "demos").symlink_to(ROOT / "demos")
+    for kind, text in steps(ROOT / "docs" / "tutorials" / f"{name}.md"):
+        if text.startswith(NEEDED[name]):
+            call(*shlex.split(text)[1:])
+        elif kind not in ("command", "python"):
+            (tmp_path / kind).write_text(text, encoding="utf-8")
+    page = visit(tmp_path, "document.querySelector('canvas')", viewport={"width": 320, "height": 240})
+    page.wait_for_timeout(4000)
+    shown = np.asarray(Image.open(io.BytesIO(page.screenshot(timeout=200_000))).convert("L"), np.float32)
+    # Without light, below the slider, the pages have one colour.
+    assert shown[60:].std() > 5.0

@@ -193,9 +193,7 @@ def test_three_adds_light_groups(tmp_path, visit):
         np.testing.assert_allclose(drawn(page, "Basic"), expected, rtol=0, atol=expected.max() / 255)
 
 
-@pytest.mark.parametrize(
-    ("kind", "colour"), [*((kind, "rgb9e5") for kind in KINDS), ("plain", "bc6h"), (MIXED, "mixed")]
-)
+@pytest.mark.parametrize("kind, colour", [*((kind, "rgb9e5") for kind in KINDS), ("plain", "bc6h"), (MIXED, "mixed")])
 def test_three_shows_an_atlas(kind, colour, tmp_path, visit):
     model = random_atlas(charts(), kind, colour)
     export(model, tmp_path / "three_js", "three")

@@ -22,13 +22,7 @@ from wlm.system import load
 HOUR = 11.0  # the hour that is nearest to noon
 STREET = Path(__file__).parents[3] / "demos" / "data" / "street"
 STORED = ["lightmap", "lightmap-frames", "lightmap-groups", "lightmap-layers", "atlas-tiles", "probe", "probe-pca"]
-ATLASES = [
-    ("tiles", "bc6h"),
-    ("tiles mixed", "mixed"),
-    ("cascade", "half"),
-    ("plain", "rgb9e5"),
-    ("plain with uv", "bc6h"),
-]
+ATLASES = {"tiles": "bc6h", "tiles mixed": "mixed", "cascade": "half", "plain": "rgb9e5", "plain with uv": "bc6h"}
 MADE = {
     "paper": lambda: synthetic.random_model((3, 3, 4, 1), hidden=18, plane_rows=5, time_axis="paper", gelu="exact"),
     "network": lambda: synthetic.random_model((3, 3, 3, 1, 3, 0), 3, interpolation="network", gamma=1.8),
@@ -38,7 +32,7 @@ MADE = {
 }
 MADE |= {
     f"{kind} {colour}": lambda kind=kind, colour=colour: atlas_models.random_model(atlas_meshes.charts(), kind, colour)
-    for kind, colour in ATLASES
+    for kind, colour in ATLASES.items()
 }
 
 

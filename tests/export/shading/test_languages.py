@@ -310,9 +310,8 @@ def shown(subject: Subject, language: str, exact: bool, folder) -> np.ndarray:
     return run_hlsl(text, "shown(pixel)", size, subject.bound, folder)
 
 
-@pytest.mark.parametrize(
-    ("name", "language"), [(name, language) for name in SUBJECTS for language in (*HEADS, "hlsl", "wgsl")]
-)
+@pytest.mark.parametrize("language", [*HEADS, "hlsl", "wgsl"])
+@pytest.mark.parametrize("name", SUBJECTS)
 def test_every_shader_shows_what_python_decodes(name, language, tmp_path):
     subject = SUBJECTS[name](tmp_path)
     channels = subject.expected.shape[-1]
