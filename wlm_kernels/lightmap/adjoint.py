@@ -22,11 +22,6 @@ def _add_fours(acc: wp.array2d[wp.int64], row: int, first: int, second: int, a: 
     `first` < 0. All lanes of a warp must call it together; `row` is each lane's address in shared memory."""
 
 
-@wp.func_native(native_source(__package__, "add_corners"))
-def _add_corners(acc: wp.array2d[wp.int64], row: int, at: wp.vec4i, v: wp.vec4):
-    """Adds four numbers to the sums with the indices `at`. All lanes of a warp must call it together."""
-
-
 @wp.func
 def _joined(parts: wp.vec4, in_x: float, in_y: float) -> wp.vec4:
     """Returns the sums for the blocks of four corners, along x first, of parts for the corners. `in_x` and `in_y` are 1
@@ -41,8 +36,7 @@ def _joined(parts: wp.vec4, in_x: float, in_y: float) -> wp.vec4:
 
 @functools.cache
 def _adders(device_kind: str) -> tuple[Any, ...]:
-    """Returns a function that adds a number, the type of the sums, and functions like `_add_fours` and
-    `_add_corners`."""
+    """Returns a function that adds a number, the type of the sums, and a function like `_add_fours`."""
     if device_kind == "cuda":
         # Fixed point with steps of 2^-40, about 1e-12; a sum beyond 8e6 would overflow.
 
@@ -50,7 +44,7 @@ def _adders(device_kind: str) -> tuple[Any, ...]:
         def add(acc: wp.array2d[wp.int64], lane: int, i: int, value: float):
             wp.atomic_add(acc, 0, i, wp.int64(value * 1099511627776.0))
 
-        return add, wp.int64, _add_fours, _add_corners
+        return add, wp.int64, _add_fours
 
     @wp.func
     def add(acc: wp.array2d[float], lane: int, i: int, value: float):
@@ -63,12 +57,7 @@ def _adders(device_kind: str) -> tuple[Any, ...]:
                 add(acc, lane, first + c, a * g[c])
                 add(acc, lane, second + c, b * g[c])
 
-    @wp.func
-    def add_corners(acc: wp.array2d[float], lane: int, at: wp.vec4i, v: wp.vec4):
-        for q in range(4):
-            add(acc, lane, at[q], v[q])
-
-    return add, float, add_fours, add_corners
+    return add, float, add_fours
 
 
 @functools.cache
@@ -76,7 +65,7 @@ def scatters(device_kind: str) -> tuple[Any, Any, Any, Any]:
     """Builds (once) for "cpu" or "cuda" the functions that add a sample's gradients to the gradient sums of the feature
     maps. Returns a `wp.func` for F_uv, one for F_uvt, one for the planes F_ut and F_vt, and the type of the sums. Their
     `lane` is the number of the sums on the CPU, on CUDA a thread's row of shared memory from `matrix_step`."""
-    add, scalar, add_fours, add_corners = _adders(device_kind)
+    add, scalar, add_fours = _adders(device_kind)
 
     @wp.func
     def scatter_texel(acc: wp.array2d[scalar], lane: int, maps: Maps, n: int, flat: int, g: wp.vec4):
@@ -96,10 +85,8 @@ def scatters(device_kind: str) -> tuple[Any, Any, Any, Any]:
             s = n * maps.slices + wp.where(k == 0, cell.t[0], cell.t[1])
             corners = corners_at(maps, s, cell)
             weights = corner_weights(cell, k)
-            on_weights = wp.vec4()
             for q in range(4):
-                on_weights[q] = weights[q] * wp.dot(corners.high[q] - corners.low[q], g)
-            add_corners(acc, lane, corners.weights, on_weights)
+                add(acc, lane, corners.weights[q], weights[q] * wp.dot(corners.high[q] - corners.low[q], g))
             first = _joined(wp.cw_mul(weights, wp.vec4(1.0) - corners.w), in_x, in_y)
             second = _joined(wp.cw_mul(weights, corners.w), in_x, in_y)
             at = corners.endpoints
