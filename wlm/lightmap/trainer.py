@@ -164,7 +164,7 @@ class Trainer:
         with interop.alone:
             self._kernels = lightmap_step.step_kernels(profile.hidden, profile.gelu, "cuda" if self._cuda else "cpu")
             self._kernels.load(device)
-            wp.load_module(gather, device)
+            gather.load(device, self._turned)
         with interop.stream(device):
             self._allocate(shapes, profile.hidden)
             self._upload(targets, seed, profile.gamma, slices)

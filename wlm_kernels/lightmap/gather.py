@@ -202,6 +202,14 @@ def _turn_kernel(width: int, threads: int) -> Any:
     return turn
 
 
+def load(device: str, turned: int) -> None:
+    """Compiles `update` for a device, and `turn` of a width, unless it is 0; the first launch would do so otherwise."""
+    wp.load_module(_update.module, device)
+    if turned:
+        threads = 1 if device == "cpu" else turned * turned // 8
+        wp.load_module(_turn_kernel(turned, threads).module, device, block_dim=threads)
+
+
 def turn(width: int, rates: wp.array, momentum: wp.array, weights: wp.array) -> None:
     """Moves the weights of networks' hidden layers of a width H, float [N (18 + H) H] as in `wlm_kernels.mlp`, with
     Muon: along their momentum made orthogonal (Jordan et al., 2024), at the rate `rates[0][1]`. Biases stay."""
