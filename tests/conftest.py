@@ -1,5 +1,6 @@
 """Shared by every test: the devices, and a cache of Warp kernels that outlasts the run."""
 
+import gc
 import os
 from pathlib import Path
 
@@ -11,6 +12,15 @@ if "PYTEST_XDIST_WORKER" in os.environ:
 # All workers share one cache, so that each kernel is compiled once: Warp builds a module in a folder of its process and
 # renames that folder. Set before anything imports Warp, which reads it when it starts.
 os.environ["WARP_CACHE_PATH"] = str(Path(__file__).resolve().parents[1] / ".cache" / "warp")
+
+
+# What imports and collection leave stays to the end: the garbage collector need not look through it each time.
+gc.disable()
+
+
+def pytest_collection_finish() -> None:
+    gc.freeze()
+    gc.enable()
 
 
 def _devices() -> list[str]:

@@ -44,13 +44,13 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def each(call: Callable[[_Item], _Answer], items: Iterable[_Item]) -> Iterator[_Answer]:
-    """Calls a function with each item, in threads, and yields the results in the items' order.
+def each(call: Callable[[_Item], _Answer], items: Iterable[_Item], most: int = _THREADS) -> Iterator[_Answer]:
+    """Calls a function with each item, in at most so many threads, and yields the results in the items' order.
 
     Threads help because NumPy releases Python's lock while it computes. If a call raises or the caller stops, calls
     that haven't started are cancelled.
     """
-    pool = ThreadPoolExecutor(min(cores(), _THREADS))
+    pool = ThreadPoolExecutor(min(cores(), most))
     try:
         yield from pool.map(call, items)
     finally:

@@ -120,7 +120,7 @@ def test_pictures_are_better_for_it(error: str):
     probes = synthetic(300)
     others, errors = seen_pixels(probes, _room(), seed=1), []
     for geometry in (None, _room()):
-        model = compress(probes, SMALL, steps=600, error=error, geometry=geometry)
+        model = compress(probes, SMALL, steps=300, error=error, geometry=geometry)
         off = model.decoder(position=probes.position).decode_probes().astype(np.float64) - probes.values
         errors.append(np.square(_reflected(others, off) * others.slopes).mean())
     assert errors[1] < 0.8 * errors[0]

@@ -33,6 +33,7 @@ MEANS = ("psnr", "ssim", "flip", "seen", "ring", "between", "border", "flicker")
 """Scores of a sheet that `Report` has as means over the sheets."""
 
 _LOST = "texel", "their tile"
+_THREADS = {"cpu": 16, "cuda": 2}
 _FEW_TEXELS = 16  # of the 16,384 texels of a tile
 _TILES_AT_ONCE = 16  # 3 MiB of decoded light in each thread, which stay in its cache
 
@@ -253,7 +254,7 @@ def _lost_light(model: SheetModel, lightmaps: SheetFrames, device: str) -> list[
             for (tile, window), decoded in zip(some, decoder.tiles([tile for tile, _ in some], stamp), strict=True):
                 part = frame[window]
                 both = part, decoded[: part.shape[0], : part.shape[1]]
-                # A mask as the index would take six times as long and hold Python's lock.
+                # A mask as the index would take six times as long.
                 valid = np.flatnonzero(inside[window])
                 own.add(*(texels.reshape(-1, 3).take(valid, 0) for texels in both), _place(tile, stamp))
         return own
@@ -261,7 +262,8 @@ def _lost_light(model: SheetModel, lightmaps: SheetFrames, device: str) -> list[
     # Loads the kernel of each kind of tile: threads must not do it at once.
     decoder.tiles(np.unique(model.kind, return_index=True)[1], model.times[0])
     with interop.one_thread():
-        for own in each(look, range(len(model.times))):
+        # Beside a GPU, which decodes, short calls of torch remain, and more threads wait for Python's lock.
+        for own in each(look, range(len(model.times)), _THREADS["cpu" if device == "cpu" else "cuda"]):
             lost.merge(own)
     return lost.warnings(model.name, *_LOST)
 
