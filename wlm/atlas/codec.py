@@ -160,23 +160,10 @@ def decode(artifact: Artifact) -> AtlasModel:
     kept = StoredScene(
         parts["mesh"].tobytes(), objects, header.uv_set, header.metres, header.hides, _masks(header, parts["mask"])
     )
-    model = AtlasModel(
-        name=header.name,
-        source=artifact.source,
-        profile=header.profile,
-        method=header.method,
-        colour=header.colour,
-        states=tuple(header.states),
-        sheets=tuple(places[:count]),
-        lut=parts["lut"],
-        factor=parts["factor"],
-        levels=tuple(places[count:stride]),
-        later=tuple(places[stride:]),
-        uv=(parts["uv"] / LUT_STEPS).astype(np.float32),
-        stored=kept,
-        report=header.report,
-        **textures,
-    )
+    settings = (header.name, artifact.source, header.profile, header.method, header.colour, tuple(header.states))
+    textures |= {name: parts[name] for name in ("lut", "factor")} | {"uv": (parts["uv"] / LUT_STEPS).astype(np.float32)}
+    rows = {"sheets": tuple(places[:count]), "levels": tuple(places[count:stride]), "later": tuple(places[stride:])}
+    model = AtlasModel(*settings, **rows, **textures, stored=kept, report=header.report)
     _check_tiles(model)
     return model
 

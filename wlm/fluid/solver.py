@@ -494,11 +494,8 @@ class Solver:
     @property
     def active_cells(self) -> int:
         """Number of cells of smoke that the last step computed; without bricks all. Waits for the device."""
-        return (
-            math.prod(self.shape)
-            if self._pool is None
-            else int(self._bricks.counts.numpy()[0]) * advection_places.CELLS
-        )
+        bricks = None if self._pool is None else int(self._bricks.counts.numpy()[0])
+        return math.prod(self.shape) if bricks is None else bricks * advection_places.CELLS
 
     @property
     def stored_bytes(self) -> int:

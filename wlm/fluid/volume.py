@@ -545,7 +545,4 @@ def _read_grids(path: Path, names: tuple[str | None, str | None], trust: bool) -
     return grids, warnings
 
 
-_FILES: dict[str, tuple[Any, str]] = {
-    ".nvdb": (NanoVdbFile, "the NanoVDB file"),
-    ".vdb": (VdbFile, "the OpenVDB file"),
-}
+_FILES: dict[str, tuple[Any, str]] = {".nvdb": (NanoVdbFile, "the NanoVDB file"), ".vdb": (VdbFile, "the OpenVDB file")}

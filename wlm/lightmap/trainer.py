@@ -132,15 +132,7 @@ class Trainer:
         batch: The training data in the form that the kernels read.
     """
 
-    def __init__(
-        self,
-        profile: Profile,
-        axis: TimeAxis,
-        targets: Targets,
-        seed: int,
-        device: str,
-        track: bool = False,
-    ):
+    def __init__(self, profile: Profile, axis: TimeAxis, targets: Targets, seed: int, device: str, track: bool = False):
         """Uploads the targets and draws the initial parameters.
 
         The seed determines the initial parameters and all samples; `track` collects the errors that `psnr` needs.

@@ -145,29 +145,6 @@ def gaussian_weight(centre: wp.vec3, log_scale: wp.vec3, rotation: wp.vec4, poin
     return wp.where(d2 < cut * cut, wp.exp(-0.5 * d2), 0.0)
 
 
-@wp.kernel
-def gaussian_sum_twin(
-    # in:
-    rows: wp.array2d[float],
-    points: wp.array1d[wp.vec3],
-    cut: float,
-    # out:
-    sums: wp.array2d[float],
-):
-    """Adds F(x) = sum_k F_k w_k(x) to `sums` [N, L] (eq. 5), a Gaussian and a point per thread: launch it over (K, N).
-
-    It is the readable twin of `wlm.ops.gaussian_sum`, whose arguments it takes: on a tape Warp derives from these lines
-    the gradients that the operation computes by hand (eq. 11 and 12 for the latents).
-    """
-    k, i = wp.tid()
-    centre = wp.vec3(rows[k, 0], rows[k, 1], rows[k, 2])
-    log_scale = wp.vec3(rows[k, 3], rows[k, 4], rows[k, 5])
-    rotation = wp.vec4(rows[k, 6], rows[k, 7], rows[k, 8], rows[k, 9])
-    weight = gaussian_weight(centre, log_scale, rotation, points[i], cut)
-    for c in range(sums.shape[1]):
-        wp.atomic_add(sums, i, c, weight * rows[k, 10 + c])
-
-
 @dataclass(frozen=True)
 class Network:
     """A network's function for use inside kernels, and its types.

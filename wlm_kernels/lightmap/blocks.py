@@ -65,10 +65,7 @@ def ste_endpoint(e: wp.vec4, quantised: int) -> wp.vec4:
     """Returns e clamped to [0, 1], or if quantised its stored bytes / 255. The adjoint takes the derivative as 1."""
     if quantised == 0:
         return wp.vec4(
-            wp.clamp(e[0], 0.0, 1.0),
-            wp.clamp(e[1], 0.0, 1.0),
-            wp.clamp(e[2], 0.0, 1.0),
-            wp.clamp(e[3], 0.0, 1.0),
+            wp.clamp(e[0], 0.0, 1.0), wp.clamp(e[1], 0.0, 1.0), wp.clamp(e[2], 0.0, 1.0), wp.clamp(e[3], 0.0, 1.0)
         )
     return over_255(endpoint_byte(e))
 
@@ -234,9 +231,5 @@ def quantise(endpoints, weights, bytes_out, index_out) -> None:
         index_out: uint8 [S, H, W], written: each weight's index, 0 to 15.
     """
     wp.launch(
-        _quantise,
-        weights.shape,
-        inputs=[endpoints, weights],
-        outputs=[bytes_out, index_out],
-        device=weights.device,
+        _quantise, weights.shape, inputs=[endpoints, weights], outputs=[bytes_out, index_out], device=weights.device
     )

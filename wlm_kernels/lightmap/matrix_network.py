@@ -101,12 +101,7 @@ def matrix_texels(hidden: int) -> Any:
 
     @wp.func_native(on_cuda(native("matrix_network", "matrix_texels", H=hidden), "return wp::vec_t<3, float>();"))
     def evaluate(
-        packed: wp.array2d[wp.uint32],
-        biases: wp.array2d[vec_hidden],
-        f: Maps,
-        encoding: wp.vec4,
-        n: int,
-        time: int,
+        packed: wp.array2d[wp.uint32], biases: wp.array2d[vec_hidden], f: Maps, encoding: wp.vec4, n: int, time: int
     ) -> wp.vec3: ...
 
     return evaluate

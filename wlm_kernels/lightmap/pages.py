@@ -478,14 +478,7 @@ def put(records, slots, parts, memory) -> None:
 
 
 def decode(
-    kernel: wp.Kernel,
-    source: tuple[Any, ...],
-    clock,
-    offsets,
-    jobs: Jobs,
-    direct: bool,
-    out,
-    blocks: int | None = None,
+    kernel: wp.Kernel, source: tuple[Any, ...], clock, offsets, jobs: Jobs, direct: bool, out, blocks: int | None = None
 ) -> None:
     """Decodes squares of texels of one light group with one launch, which a CUDA graph can capture.
 

@@ -134,19 +134,11 @@ def fit_cascade(
         textures = tune(sheet, uv, start, profile, seed=seed, **options)
     with stages("write"):
         stored = quantise(textures.colour, profile.colour)
-    return AtlasModel(
-        name=scene.name,
-        source=scene.source,
-        profile=profile,
-        method="cascade" if textures.lut.size else "plain",
-        colour=profile.colour,
-        states=scene.states,
-        sheets=(SheetPlace(sheet.name, *sheet.mask.shape),),
-        **{name: texture[None] for name, texture in stored.items()},
-        lut=np.rint(textures.lut * LUT_STEPS).astype(np.uint16),
-        uv=uv,
-        report={"triangles": count, **facts, "steps": profile.steps},
-    )
+    method, parts = "cascade" if textures.lut.size else "plain", {name: part[None] for name, part in stored.items()}
+    settings = (scene.name, scene.source, profile, method, profile.colour, scene.states)
+    parts |= {"lut": np.rint(textures.lut * LUT_STEPS).astype(np.uint16), "uv": uv}
+    report = {"triangles": count, **facts, "steps": profile.steps}
+    return AtlasModel(*settings, (SheetPlace(sheet.name, *sheet.mask.shape),), **parts, report=report)
 
 
 def initial(lightmap: np.ndarray, mask: np.ndarray, profile: Profile) -> Textures:

@@ -71,21 +71,10 @@ def fit_shared(scene: LightmappedScene, profile: Profile, seed: int, stages: Sta
     }
     # With separate tiles every state has the factors of a single state, times its own unit.
     factor = (given.factors * unit[:, None] / scale[:, None]).transpose(1, 0, 2).astype(np.float32)
-    return AtlasModel(
-        name=scene.name,
-        source=scene.source,
-        profile=profile,
-        method="shared",
-        colour="mixed" if "blocks" in textures else TEXELS,
-        states=scene.states,
-        sheets=tuple(rows[:sheets]),
-        lut=lut,
-        factor=np.ascontiguousarray(factor),
-        levels=tuple(rows[sheets:stride]),
-        later=tuple(rows[stride:]),
-        report=report,
-        **textures,
-    )
+    textures |= {"lut": lut, "factor": np.ascontiguousarray(factor)}
+    places = {"sheets": tuple(rows[:sheets]), "levels": tuple(rows[sheets:stride]), "later": tuple(rows[stride:])}
+    settings = (scene.name, scene.source, profile, "shared", "mixed" if "blocks" in textures else TEXELS, scene.states)
+    return AtlasModel(*settings, **places, **textures, report=report)
 
 
 def _textures(tiles: SceneTiles, tried: list[Candidate], given: Allocated) -> tuple[dict[str, np.ndarray], np.ndarray]:
