@@ -99,11 +99,9 @@ def profile_folders() -> Iterator[Path]:
 
 
 class _Loader(yaml.SafeLoader):
-    """A safe loader that rejects YAML features which settings do not need and an attacker could misuse.
-
-    It rejects repeated keys, for which YAML would silently use the last value; anchors, aliases and merge keys, with
-    which a few lines can expand to billions of values; integers beyond 64 bits; and unlimited nesting.
-    """
+    """A safe loader that rejects YAML features which settings do not need and an attacker could misuse. It rejects
+    repeated keys, for which YAML would silently use the last value; anchors, aliases and merge keys, with which a few
+    lines can expand to billions of values; integers beyond 64 bits; and unlimited nesting."""
 
     _depth = 0
 

@@ -121,9 +121,8 @@ class Place(NamedTuple):
 
 
 def start_workers(worker: tuple, place: Place, tasks: int) -> Workers:
-    """Starts workers, at most one for each of so many tasks; a single one on this machine is in this process.
-
-    `worker` is a class, from a module that can be imported, and its arguments after the first, a device."""
+    """Starts workers, at most one for each of so many tasks; a single one on this machine is in this process. `worker`
+    is a class, from a module that can be imported, and its arguments after the first, a device."""
     make, *arguments = worker
     devices = place.devices()[:tasks]
     if place.cluster is not None:

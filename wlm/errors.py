@@ -32,11 +32,8 @@ def counted(number: int, noun: str, plural: str = "") -> str:
 
 
 class WlmError(Exception):
-    """An error that the user can act on: one line that names the file, the field and what was expected.
-
-    The command line shows the line alone. Wrong use of a function by a programmer is a `ValueError` or a
-    `TypeError` instead.
-    """
+    """An error that the user can act on: one line that names the file, the field and what was expected. The command
+    line shows the line alone. Wrong use of a function by a programmer is a `ValueError` or a `TypeError` instead."""
 
     def __init__(self, message: object) -> None:
         super().__init__(one_line(message))

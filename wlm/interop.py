@@ -152,10 +152,8 @@ def no_collection() -> Iterator[None]:
 
 
 def torch_memory(device: torch.device) -> Callable[[tuple[int, ...], Any], wp.array]:
-    """Returns an allocator for kernel buffers, `empty(shape, dtype)`, that uses torch's memory.
-
-    Unlike Warp's memory, it may be freed while torch's stream still uses it, and a graph may capture it.
-    """
+    """Returns an allocator for kernel buffers, `empty(shape, dtype)`, that uses torch's memory. Unlike Warp's memory,
+    it may be freed while torch's stream still uses it, and a graph may capture it."""
 
     def empty(shape: tuple[int, ...], dtype: Any) -> wp.array:
         kind, tail = _TENSORS[dtype]

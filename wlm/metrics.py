@@ -251,10 +251,7 @@ class Pictures:
 
     def add(self, reference: np.ndarray, test: np.ndarray, seen: np.ndarray) -> dict[str, float] | None:
         """Adds a pair of pictures [H, W, 3], sRGB in [0, 1], and returns its `psnr` and `flip`; None if no pixel is
-        covered.
-
-        `seen`, bool [H, W], is true for covered pixels; all others have the same value in both pictures.
-        """
+        covered. `seen`, bool [H, W], is true for covered pixels; all others have the same value in both pictures."""
         count = int(np.count_nonzero(seen))
         if not count:
             return None
@@ -499,10 +496,7 @@ def summarise(frames: Sequence[FrameMetrics], times: Sequence[float] | np.ndarra
 
 def lowest(psnr: np.ndarray, times: Sequence[float] | np.ndarray) -> dict[str, float | int] | None:
     """Returns the lowest PSNR of tiles, [T, ny, nx] in dB, NaN for tiles without a score, and its place; None if all
-    are NaN.
-
-    The keys are `psnr`; `time`; `tile`, the number of the tile, row by row; its `row` and `column`.
-    """
+    are NaN. The keys are `psnr`; `time`; `tile`, the number of the tile, row by row; its `row` and `column`."""
     if np.isnan(psnr).all():
         return None
     at = np.unravel_index(np.nanargmin(psnr), psnr.shape)

@@ -73,10 +73,8 @@ class Settings(Checked):
         return load_settings(cls, path if path.endswith((".yaml", ".yml")) else profile_path(cls.FILES, path))
 
     def override(self, values: Mapping[str, Any], prefix: str = "") -> Self:
-        """Returns the settings with new values by name; None leaves a setting as it is.
-
-        `prefix` is the text before the setting's name in an error; `"--"` writes the name as an option.
-        """
+        """Returns the settings with new values by name; None leaves a setting as it is. `prefix` is the text before the
+        setting's name in an error; `"--"` writes the name as an option."""
         changes = {name: value for name, value in values.items() if value is not None}
         return check_settings(type(self), self.model_dump() | changes, prefix) if changes else self
 
@@ -156,10 +154,8 @@ def plain(value: Any) -> Any:
 
 
 class Header(Checked):
-    """Base of the classes that describe and check the settings in a model file's header.
-
-    Types are strict: a text is never read as a number, nor a float as a count. NaN and infinity are refused.
-    """
+    """Base of the classes that describe and check the settings in a model file's header. Types are strict: a text is
+    never read as a number, nor a float as a count. NaN and infinity are refused."""
 
     model_config = ConfigDict(strict=True)
 
@@ -200,10 +196,7 @@ class Model:
 
     def bundle(self, device: str = "cpu", **options: Any) -> "Bundle":
         """Converts the model to textures, buffers and shader source for a GPU; the device computes the reference
-        values.
-
-        `options` are passed to the function `bundle` of the system.
-        """
+        values. `options` are passed to the function `bundle` of the system."""
         return _module(self.SYSTEM, "bundle").bundle(self, device=device, **options)
 
     def check(self) -> None:

@@ -70,11 +70,8 @@ class Workers(ABC):
         """Starts a method call on a worker that has no call in progress."""
 
     def wait(self, seconds: float) -> tuple[int, Any] | None:
-        """Waits for the next result, at most some seconds; None if there was none in that time.
-
-        Returns the worker's number and the method's return value, the exception that it raised, or `Lost` if the worker
-        no longer exists.
-        """
+        """Waits for the next result, at most some seconds; None if there was none in that time. Returns the worker's
+        number and the method's return value, the exception that it raised, or `Lost` if the worker no longer exists."""
         try:
             return self._answers.get(timeout=seconds)
         except queue.Empty:
@@ -145,10 +142,8 @@ class Threads(Workers):
 
 
 class Processes(Workers):
-    """Workers in separate processes on this machine.
-
-    A worker process ends when its parent process ends for any reason, at the latest after its current call.
-    """
+    """Workers in separate processes on this machine. A worker process ends when its parent process ends for any reason,
+    at the latest after its current call."""
 
     def __init__(self, make: type, arguments: list[tuple[Any, ...]]) -> None:
         """Starts the processes. `make` is the class of the workers, from an importable module. `arguments` are the

@@ -103,10 +103,8 @@ class MlpKernels:
     _backward: Any
 
     def forward(self, hidden, output, x, y) -> None:
-        """Evaluates N networks on B inputs each, `x`, vecI [N, B]; writes the outputs `y`, vecO [N, B].
-
-        The layers are `hidden`, vecH [N, I + H + 2], see the module, and `output`, vecO [N, H + 1].
-        """
+        """Evaluates N networks on B inputs each, `x`, vecI [N, B]; writes the outputs `y`, vecO [N, B]. The layers are
+        `hidden`, vecH [N, I + H + 2], see the module, and `output`, vecO [N, H + 1]."""
         wp.launch(self._forward, x.shape, inputs=[hidden, output, x], outputs=[y], device=x.device)
 
     def backward(self, hidden, output, x, grad_y, grad_x, h1, h2, d1, d2) -> None:

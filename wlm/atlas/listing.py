@@ -159,9 +159,8 @@ def read_listing(path: str | os.PathLike[str]) -> Listing:
 
 
 def _object(entry: Any, convention: str, where: str) -> Any:
-    """Converts an object's names and rectangle, in an engine's convention, to UV * scale + offset with v downwards.
-
-    A malformed rectangle raises WlmError; other malformed input is kept, since later checks report it."""
+    """Converts an object's names and rectangle, in an engine's convention, to UV * scale + offset with v downwards. A
+    malformed rectangle raises WlmError; other malformed input is kept, since later checks report it."""
     if not isinstance(entry, dict):
         return entry
     entry = dict(entry)

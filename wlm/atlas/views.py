@@ -38,10 +38,8 @@ class Points:
 
 
 def scene_views(scene: LightmappedScene, count: int, seed: int | None = None) -> list[View | Viewpoint]:
-    """Makes `count` cameras around a scene and, where viewers can stand in it, as many inside.
-
-    Without a seed they are spread evenly; a seed places all, also those inside, at random.
-    """
+    """Makes `count` cameras around a scene and, where viewers can stand in it, as many inside. Without a seed they are
+    spread evenly; a seed places all, also those inside, at random."""
     return [*sphere_views(count, seed), *scene.indoors.views(count, 0 if seed is None else seed)]
 
 

@@ -41,9 +41,7 @@ class Texels:
 
 def place_texels(where: str, surfaces: Sequence[Surface], resolution: int, supersample: int) -> Texels:
     """Computes the sample positions of all texels: those points of a lattice in each texel that a triangle covers.
-
-    Surfaces without lightmap UVs are skipped; `where` names the geometry in errors.
-    """
+    Surfaces without lightmap UVs are skipped; `where` names the geometry in errors."""
     used = [each for each in surfaces if each.uv is not None]
     side = resolution * supersample
     if side > _MOST_SIDE:

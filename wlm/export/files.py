@@ -30,9 +30,7 @@ _UNORM_16 = 65535
 
 def write_texture(folder: Path, name: str, texture: Texture, ending: str | None = None) -> dict[str, Any]:
     """Writes a texture as DDS, or as KTX2 if DDS lacks its format, and returns its entry for the folder's index.
-
-    `ending` replaces the usual ending of the file's name, ".dds" or ".ktx2".
-    """
+    `ending` replaces the usual ending of the file's name, ".dds" or ".ktx2"."""
     if max(texture.width, texture.height) > MOST_SIDE:
         size = f"{texture.width}x{texture.height}"
         raise WlmError(f"{name}: cannot export: expected at most {MOST_SIDE} texels along a side, found {size}")

@@ -22,8 +22,7 @@ class Face:
     """The boundary condition on a face of A x B cells, along the two axes of the face in the order x, y, z: for each
     cell the kind of boundary, such as `lattice_links.BOUNCE`; the velocity of a wall or an inlet, float64 [A, B, 3],
     cells per step; and its rank: where two faces meet at the edges of the box, the lower decides. `excess` is the
-    density minus 1 to which an outlet with a given density relaxes.
-    """
+    density minus 1 to which an outlet with a given density relaxes."""
 
     rank: np.ndarray
     kind: np.ndarray

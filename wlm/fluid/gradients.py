@@ -132,10 +132,8 @@ class DifferentiableLattice:
 
     @takes_arrays("populations", "force")
     def fields(self, populations: torch.Tensor, force: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
-        """Computes the density minus 1, [X, Y, Z], and the velocity, [X, Y, Z, 3], of the air.
-
-        In solid cells they are 0 and the body's velocity, without gradients. Arguments and errors: see `advance`.
-        """
+        """Computes the density minus 1, [X, Y, Z], and the velocity, [X, Y, Z, 3], of the air. In solid cells they are
+        0 and the body's velocity, without gradients. Arguments and errors: see `advance`."""
         self._check(populations)
         return _Fields.apply(self, populations, self._force(force))
 
@@ -403,8 +401,7 @@ class DifferentiableSolver:
 class _Work:
     """Small arrays that the steps of a call use, in torch's memory: `clock`, `trouble` and `sums` of
     `wlm_kernels.fluid.lattice.step_kernel`, the first two also as tensors, and the lattice's links with terms and
-    values of this call.
-    """
+    values of this call."""
 
     def __init__(self, air: DifferentiableLattice) -> None:
         links, device = air._setup.links, air.device

@@ -341,9 +341,8 @@ class Lattice:
         return dict(self._faces)
 
     def set_growth(self, growth: wp.array) -> None:
-        """Lets the air expand: `growth`, float [X, Y, Z] on the device, is the share of its volume that a cell gains
-        in a step. It is not copied, and its values may change between steps. A face needs an outlet with a density.
-        """
+        """Lets the air expand: `growth`, float [X, Y, Z] on the device, is the share of its volume that a cell gains in
+        a step. It is not copied, and its values may change between steps. A face needs an outlet with a density."""
         self._growth, self._graph = growth.flatten(), None
 
     @property
@@ -455,10 +454,8 @@ class Lattice:
         return self._cells - solid + float(self.excess_density().numpy().sum(dtype=np.float64))
 
     def force_on_solid(self, body: int = 1) -> np.ndarray:
-        """Returns the force of the air on a body in the last step, by momentum exchange, float64 (3,).
-
-        The pressure of air at rest at density 1 is excluded; on a body that air surrounds its sum is 0.
-        """
+        """Returns the force of the air on a body in the last step, by momentum exchange, float64 (3,). The pressure of
+        air at rest at density 1 is excluded; on a body that air surrounds its sum is 0."""
         if not 0 < body < BODIES:
             raise ValueError(f"body: expected 1 to {BODIES - 1}, got {body}")
         self._prepare()

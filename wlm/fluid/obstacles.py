@@ -323,9 +323,7 @@ class Bodies:
 
     def move(self, clock: wp.array, pace: float, solid: wp.array, fresh: wp.array, stamp: int) -> None:
         """Sets `motion` to that in the middle of the next step, and the marks of the obstacles that move accordingly.
-
-        Arguments: see `lattice_bodies.set_poses` and `lattice_bodies.mark`.
-        """
+        Arguments: see `lattice_bodies.set_poses` and `lattice_bodies.mark`."""
         lattice_bodies.set_poses(self._keys, clock, pace, self.motion)
         self._mark(self.moving, solid, fresh, stamp)
 

@@ -408,9 +408,7 @@ def _check(
     dtype: torch.dtype | None = None,
 ) -> torch.Tensor:
     """Returns a field as a tensor, with NaN, infinite and negative values set to 0, for which warnings are added.
-
-    `dtype` is the type of the tensor; None: half floats if the values are half floats, else float32.
-    """
+    `dtype` is the type of the tensor; None: half floats if the values are half floats, else float32."""
     if not isinstance(values, torch.Tensor):
         values = np.asarray(values)
         if values.dtype.kind not in "iuf" or values.dtype == np.longdouble:

@@ -294,10 +294,8 @@ def _index_of(pieces: Sequence[bytes]) -> np.ndarray:
 
 
 def _check_pieces(where: str, entry: tuple[str, tuple[int, ...], int, int], index: np.ndarray, end: int) -> None:
-    """Checks the sizes of the pieces of a part, so that none overlaps another or exceeds the part.
-
-    `end` is the end of the parts that are not split, from the first part on.
-    """
+    """Checks the sizes of the pieces of a part, so that none overlaps another or exceeds the part. `end` is the end of
+    the parts that are not split, from the first part on."""
     kind, shape, first, last = entry
     words = 1 + _DIGEST_BYTES // _WORDS.itemsize
     if index.dtype != _WORDS or index.shape != (len(index), words) or kind != "U8" or len(shape) != 1:

@@ -108,10 +108,8 @@ def _layouts() -> np.ndarray:
 
 
 def _groups() -> np.ndarray:
-    """Returns the bits of five trits by the trits as a number, the first the lowest.
-
-    Of several codes it is the least, since a group that is cut off at its end is filled up with zeros.
-    """
+    """Returns the bits of five trits by the trits as a number, the first the lowest. Of several codes it is the least,
+    since a group that is cut off at its end is filled up with zeros."""
     table = np.zeros(243, np.int32)
     for code in reversed(range(256)):
         rest, t3, t4 = code & 31, code >> 5 & 3, code >> 7

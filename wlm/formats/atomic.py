@@ -50,10 +50,8 @@ def sync_folder(folder: Path) -> None:
 
 
 def atomic_write(path: str | os.PathLike[str], data: bytes | Iterable[bytes]) -> int:
-    """Writes a file completely or not at all, and returns its number of bytes; see `atomic_path`.
-
-    `data` is the content, or its pieces in order, as objects with the buffer protocol.
-    """
+    """Writes a file completely or not at all, and returns its number of bytes; see `atomic_path`. `data` is the
+    content, or its pieces in order, as objects with the buffer protocol."""
     chunks = [data] if isinstance(data, bytes | bytearray | memoryview) else data
     with atomic_path(path) as part, open(part, "wb") as file:
         return sum(map(file.write, chunks))

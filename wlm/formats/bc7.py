@@ -125,9 +125,7 @@ def pack_mode6(endpoints: np.ndarray, indices: np.ndarray) -> np.ndarray:
 
 def decode_image(blocks: np.ndarray) -> np.ndarray:
     """Decodes images of blocks of any mode, uint8 [..., R, C, 16], bit-exactly to RGBA, uint8 [..., 4 R, 4 C, 4].
-
-    Blocks whose first byte is 0, which the format reserves, become black.
-    """
+    Blocks whose first byte is 0, which the format reserves, become black."""
     if blocks.dtype != np.uint8 or blocks.ndim < 3 or blocks.shape[-1] != BLOCK_BYTES:
         raise ValueError(f"blocks: expected uint8 [..., H/4, W/4, 16], got {blocks.dtype} {blocks.shape}")
     *rest, rows, columns, _ = blocks.shape

@@ -91,10 +91,8 @@ def read_encoded(path: str | os.PathLike[str], encoding: str, notes: list[str] |
 
 
 def parse_encoding(encoding: str) -> tuple[str, float, float]:
-    """Returns the name of an encoding, its range, which is 0 if none is stated, and its gamma.
-
-    The name of "layer:NAME" is "layer:".
-    """
+    """Returns the name of an encoding, its range, which is 0 if none is stated, and its gamma. The name of "layer:NAME"
+    is "layer:"."""
     if encoding.startswith(_LAYER) and len(encoding) > len(_LAYER):
         return _LAYER, 0.0, 1.0
     name, *numbers = encoding.split(":")

@@ -125,10 +125,8 @@ class Checkpoint:
         return self._running.get(number)
 
     def restore(self, number: int, load: Callable[[dict[str, np.ndarray]], None]) -> bool:
-        """Restores the state of an unfinished batch, and returns whether the checkpoint has one.
-
-        `load` restores a state; for an invalid one it raises ValueError before it changes anything.
-        """
+        """Restores the state of an unfinished batch, and returns whether the checkpoint has one. `load` restores a
+        state; for an invalid one it raises ValueError before it changes anything."""
         if (state := self.running(number)) is None:
             return False
         try:
@@ -151,10 +149,8 @@ class Checkpoint:
         self._write()
 
     def add_finished(self, number: int, result: Mapping[str, np.ndarray]) -> None:
-        """Adds the results of a finished batch, by name, and removes the state of its unfinished work.
-
-        The file is written at once if that takes at most a twentieth of the time, otherwise at the next save.
-        """
+        """Adds the results of a finished batch, by name, and removes the state of its unfinished work. The file is
+        written at once if that takes at most a twentieth of the time, otherwise at the next save."""
         self._finished[number] = dict(result)
         self._running.pop(number, None)
         self._unwritten = True

@@ -38,10 +38,8 @@ def digest(*pieces: bytes | np.ndarray) -> bytes:
 
 
 def encode_compact(system: str, parts: Mapping[str, np.ndarray]) -> list[bytes | np.ndarray]:
-    """Encodes a compact artifact of a system in `SYSTEMS`; returns the file's content as consecutive buffers.
-
-    `parts` has only one part: `BODY`, uint8 [bytes].
-    """
+    """Encodes a compact artifact of a system in `SYSTEMS`; returns the file's content as consecutive buffers. `parts`
+    has only one part: `BODY`, uint8 [bytes]."""
     begin = _MAGIC + bytes([SYSTEMS.index(system) << 4 | _VERSION])
     return [begin + digest(begin, parts[BODY]), parts[BODY]]
 

@@ -291,10 +291,8 @@ def read_planes(path: str | os.PathLike[str]) -> tuple[dict[str, np.ndarray], di
 
 
 def read_header(path: str | os.PathLike[str]) -> tuple[int, int, tuple[str, ...]]:
-    """Reads the size of the display window and the names of all channels of an EXR file, without its pixels.
-
-    In a file of several parts, a name begins with that of its part.
-    """
+    """Reads the size of the display window and the names of all channels of an EXR file, without its pixels. In a file
+    of several parts, a name begins with that of its part."""
     parts = check_header(path)
     return *parts[0].size, tuple(name for part in parts for name in part.full_names(len(parts) > 1))
 

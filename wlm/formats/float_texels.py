@@ -61,10 +61,8 @@ class Layout:
 
 
 def check_picture(path: str | os.PathLike[str], held: int, width: int, height: int, texel: int) -> None:
-    """Checks the claimed size of a picture, in texels of `texel` decoded bytes, before memory is allocated.
-
-    `held` is the size of the file in bytes, `path` names it in messages.
-    """
+    """Checks the claimed size of a picture, in texels of `texel` decoded bytes, before memory is allocated. `held` is
+    the size of the file in bytes, `path` names it in messages."""
     check_sides(str(path), width, height)
     check_growth(str(path), held, width * height * texel, PICTURE_GROWTH, PICTURE_BYTES)
 
@@ -147,10 +145,8 @@ def format_bytes(fmt: str, width: int, height: int) -> int:
 
 
 def mip_bytes(fmt: str, width: int, height: int, mips: int, most: int | None = None) -> list[int]:
-    """Returns the bytes of each mip level of a picture, the largest first.
-
-    `mips` is the number of levels after the largest one, and `most` their largest number; None: down to one texel.
-    """
+    """Returns the bytes of each mip level of a picture, the largest first. `mips` is the number of levels after the
+    largest one, and `most` their largest number; None: down to one texel."""
     if not (1 <= width <= MOST_SIDE and 1 <= height <= MOST_SIDE):
         raise ValueError(f"expected a width and a height of 1 to {MOST_SIDE} texels, got {width}x{height}")
     most = max(width, height).bit_length() - 1 if most is None else most

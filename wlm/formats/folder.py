@@ -27,10 +27,8 @@ _NUMBERS = re.compile(r"\[\n([^\[\]{}\"]*)\]")
 
 
 def claim(folder: Path, index: str, format_name: str) -> None:
-    """Checks, before long work, that a folder can be written and holds no files other than an earlier output.
-
-    The earlier output is recognised by its index file and the `format` in it.
-    """
+    """Checks, before long work, that a folder can be written and holds no files other than an earlier output. The
+    earlier output is recognised by its index file and the `format` in it."""
     with system_errors(f"{folder}: cannot write there"):
         if folder.exists() and read_index(folder / index).get("format") != format_name:
             # Temporary files of a killed process do not count.

@@ -31,10 +31,8 @@ class Geometry:
 
     @property
     def is_room(self) -> bool:
-        """Whether the geometry is an interior: most triangles face the middle, like inward-facing walls.
-
-        The enclosed volume (a sum of signed tetrahedra) is negative for triangles that face inwards.
-        """
+        """Whether the geometry is an interior: most triangles face the middle, like inward-facing walls. The enclosed
+        volume (a sum of signed tetrahedra) is negative for triangles that face inwards."""
         if not len(self.triangle):
             return False
         low, high = (corner.astype(np.float64) for corner in self.box)

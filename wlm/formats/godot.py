@@ -114,11 +114,8 @@ def read_users(path: str | os.PathLike[str]) -> GodotUsers:
 
 
 def read_lmbake(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray]:
-    """Reads the light probes of a Godot 4 lightmap bake, at least one.
-
-    Returns the positions, float64 [N, 3] in metres, and the stored coefficients, float32 [N, 9, 3] in RGB, which the
-    module's description defines.
-    """
+    """Reads the light probes of a Godot 4 lightmap bake, at least one. Returns the positions, float64 [N, 3] in metres,
+    and the stored coefficients, float32 [N, 9, 3] in RGB, which the module's description defines."""
     points, colours, _, _ = _read(path)
     return points, colours.reshape(len(points), COEFFICIENTS, 4)[..., :3].copy()
 
@@ -223,10 +220,8 @@ def _open(reader: _Reader) -> tuple[list[str], list[str]]:
 
 
 class _Reader:
-    """Reads numbers and values from bytes, and raises an error at their end.
-
-    A stated length is compared with the remaining bytes before anything is allocated.
-    """
+    """Reads numbers and values from bytes, and raises an error at their end. A stated length is compared with the
+    remaining bytes before anything is allocated."""
 
     def __init__(self, path: str | os.PathLike[str], data: bytes, start: int, held: int) -> None:
         self.path = path

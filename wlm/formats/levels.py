@@ -38,10 +38,8 @@ _ORIENTATION = 0x0112  # tag of EXIF
 
 
 def level_kind(path: str | os.PathLike[str], head: bytes) -> str | None:
-    """Returns "PNG", "JPEG", "WebP", "TGA" or "TIFF" for a file that begins with `head`, None for others.
-
-    A TGA has no mark at its beginning: it is known by its suffix. A BigTIFF is not known.
-    """
+    """Returns "PNG", "JPEG", "WebP", "TGA" or "TIFF" for a file that begins with `head`, None for others. A TGA has no
+    mark at its beginning: it is known by its suffix. A BigTIFF is not known."""
     if head.startswith(b"\x89PNG"):
         return "PNG"
     if head.startswith(b"\xff\xd8\xff"):

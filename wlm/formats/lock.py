@@ -35,10 +35,8 @@ def is_passing(name: str) -> bool:
 
 @contextmanager
 def locked(output: str | os.PathLike[str]) -> Iterator[None]:
-    """Locks an output against other processes, and removes temporary files that killed processes left.
-
-    The lock is on a file beside the output, which is removed at the end. Locks may be nested within one process.
-    """
+    """Locks an output against other processes, and removes temporary files that killed processes left. The lock is on a
+    file beside the output, which is removed at the end. Locks may be nested within one process."""
     target = Path(os.path.realpath(output))
     lock = target.parent / f"{_stem(target)}.lock"
     handle = None

@@ -30,10 +30,8 @@ _ZERO = re.compile(rb"^ *f [^\r\n]*[ /]0(?=[ /\r\n]|\Z)", re.MULTILINE)
 
 @dataclass(frozen=True, eq=False)
 class MeshArrays:
-    """The triangles of a file, int32 [F, 3], in the order of the file, maybe none, of vertices float64 [V, 3].
-
-    Their UVs are float64 [V, 2], u right, v down; None where the file or some of its meshes have no UVs.
-    """
+    """The triangles of a file, int32 [F, 3], in the order of the file, maybe none, of vertices float64 [V, 3]. Their
+    UVs are float64 [V, 2], u right, v down; None where the file or some of its meshes have no UVs."""
 
     position: np.ndarray
     uv: np.ndarray | None

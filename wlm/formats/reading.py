@@ -25,10 +25,8 @@ _LONGEST_NAME = 1024  # characters; systems allow 255 for each component
 
 @contextmanager
 def open_file(path: str | os.PathLike[str], what: str) -> Iterator[BinaryIO]:
-    """Opens a regular file; system errors inside the block become one-line errors that name it.
-
-    Links are followed. `what` describes the file in messages, for example "the OBJ file".
-    """
+    """Opens a regular file; system errors inside the block become one-line errors that name it. Links are followed.
+    `what` describes the file in messages, for example "the OBJ file"."""
     try:
         # Opened without blocking, since a pipe without a writer would never open.
         handle = os.open(path, _FLAGS)

@@ -20,10 +20,8 @@ Shapes = dict[str, list[int]]
 
 
 def compress(*pieces: bytes) -> bytes:
-    """Compresses consecutive pieces of data into one Zstandard frame that states its size.
-
-    Each piece has blocks of its own, so that zstd models pieces with different statistics separately.
-    """
+    """Compresses consecutive pieces of data into one Zstandard frame that states its size. Each piece has blocks of its
+    own, so that zstd models pieces with different statistics separately."""
     size = sum(map(len, pieces))
     packer = zstandard.ZstdCompressor(level=_LEVEL if size <= _FAST_BYTES else _FAST_LEVEL).compressobj(size=size)
     frame = b""

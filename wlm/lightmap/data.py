@@ -437,10 +437,8 @@ def from_groups(sets: Mapping[str, LightmapSet], name: str = "groups") -> Lightm
 
 
 def at_times(times: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Returns for each time of `wanted` its index in `times`, -1 if it is not there, int [K].
-
-    Times that differ by a millionth count as equal: a file stores them as float32 if that keeps them distinct.
-    """
+    """Returns for each time of `wanted` its index in `times`, -1 if it is not there, int [K]. Times that differ by a
+    millionth count as equal: a file stores them as float32 if that keeps them distinct."""
     close = np.isclose(np.asarray(wanted)[:, None], times[None], rtol=_TIME_TOLERANCE, atol=_TIME_TOLERANCE)
     return np.where(close.any(1), close.argmax(1), -1)
 
@@ -513,9 +511,7 @@ def _resized(mask: np.ndarray, *size: int) -> np.ndarray:
 @dataclass(frozen=True, eq=False)
 class _States:
     """Times and labels of a set's lightmaps, in the order given; `where` and `mask_from` are words for messages.
-
-    `present`, bool [T], states at which of the sorted times there is a picture.
-    """
+    `present`, bool [T], states at which of the sorted times there is a picture."""
 
     labels: Sequence[str]
     times: np.ndarray

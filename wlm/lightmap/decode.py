@@ -19,10 +19,8 @@ _PIECE = 1024  # tiles that are decoded at once: 192 MiB
 
 
 def device_of(device: str) -> str:
-    """Checks a device as `wlm.interop.check_device` does, but without torch for the CPU, which is always there.
-
-    A program that only decodes on the CPU then takes some 200 MB less memory.
-    """
+    """Checks a device as `wlm.interop.check_device` does, but without torch for the CPU, which is always there. A
+    program that only decodes on the CPU then takes some 200 MB less memory."""
     if device == "cpu":
         return device
     from wlm.interop import check_device

@@ -55,10 +55,8 @@ def in_groups(sheets: Mapping[Sheet, T], sheet: Sheet) -> dict[Sheet, T]:
 
 
 def times_of(sheets: Mapping[Sheet, Timed]) -> np.ndarray:
-    """Returns the times of all groups, float64 [T], increasing.
-
-    Groups with one time count only if no group has more: their light does not change.
-    """
+    """Returns the times of all groups, float64 [T], increasing. Groups with one time count only if no group has more:
+    their light does not change."""
     each = {sheet.group: own.times for sheet, own in sheets.items()}
     changing = [times for times in each.values() if len(times) > 1] or list(each.values())[:1]
     return changing[0] if len(changing) == 1 else np.unique(np.concatenate(changing))

@@ -49,11 +49,8 @@ def stored_part(model: LightmapModel, lightmaps: LightmapSet) -> LightmapSet:
 def score_held_out(
     model: SheetModel, stored: SheetFrames, whole: SheetFrames, device: str, metrics: Sequence[str]
 ) -> HeldOut | None:
-    """Scores a sheet at the times that its model does not store; None if there are none.
-
-    `stored` is its input at the stored times, from `stored_part`, and `whole` the whole input; `metrics` are any of
-    `wlm.metrics.METRICS`.
-    """
+    """Scores a sheet at the times that its model does not store; None if there are none. `stored` is its input at the
+    stored times, from `stored_part`, and `whole` the whole input; `metrics` are any of `wlm.metrics.METRICS`."""
     held = np.setdiff1d(np.arange(len(whole.times)), at_times(whole.times, stored.times))
     if not len(held):
         return None

@@ -189,9 +189,7 @@ def natural(name: str) -> list[str | int]:
 
 def state_folders(folder: Path) -> list[Path]:
     """Returns the folders that hold lightmaps with Unity's names: the folder itself, or folders in it in natural order.
-
-    A folder with lightmaps of other names is a plain set, whatever the folders in it contain.
-    """
+    A folder with lightmaps of other names is a plain set, whatever the folders in it contain."""
     with system_errors(f"{folder}: cannot read"):
         if _has_light(folder):
             return [folder]

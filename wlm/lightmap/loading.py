@@ -100,10 +100,8 @@ class TileLoader:
             raise WlmError(f"{self._model.name}: expected an open loader, got one that was closed")
 
     def cancel(self, sheet: Sheet | None = None, number: int | None = None) -> int:
-        """Drops waiting requests, of one tile, of all tiles of a sheet, or all, and returns their number.
-
-        A tile that is being read, and results that nobody has taken, are not affected.
-        """
+        """Drops waiting requests, of one tile, of all tiles of a sheet, or all, and returns their number. A tile that
+        is being read, and results that nobody has taken, are not affected."""
         with self._change:
             dropped = [tile for tile in self._waiting if sheet in (None, tile[0]) and number in (None, tile[1])]
             for tile in dropped:

@@ -88,10 +88,7 @@ def tiles_of(kind: np.ndarray, kinds: Iterable[TileKind]) -> np.ndarray:
 
 def part_table(profile: Profile, kind: np.ndarray, times: int) -> dict[str, Part]:
     """Returns the types and shapes of the arrays of a sheet with tiles of the given `TileKind`s, uint8 [tiles], at T =
-    `times` times.
-
-    The rows are the tiles of one kind, by rising number: dynamic, constant or stored as frames.
-    """
+    `times` times. The rows are the tiles of one kind, by rising number: dynamic, constant or stored as frames."""
     constant, dynamic, framed = (int((kind == own).sum()) for own in (TileKind.CONSTANT, *PACKED_KINDS))
     r = profile.uvt_resolution // 4
     plane = Part(np.uint8, (dynamic, profile.plane_rows, profile.plane_columns, 2))
@@ -305,10 +302,8 @@ class LightmapModel(Sheets[SheetModel], Model):
             own.check()
 
     def close(self) -> None:
-        """Closes the file that the model was loaded from: tiles that were not read before are errors from now on.
-
-        The file is also closed when the model and everything that was made of it are no longer referred to.
-        """
+        """Closes the file that the model was loaded from: tiles that were not read before are errors from now on. The
+        file is also closed when the model and everything that was made of it are no longer referred to."""
         for own in self.sheets.values():
             own.close()
 

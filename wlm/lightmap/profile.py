@@ -17,10 +17,8 @@ _USUAL_TIMES = 26  # number of times of the paper's sets
 
 
 class Profile(Settings):
-    """Settings of a fit: the sizes of the feature maps (table 3 of the paper) and the training.
-
-    Each field is described by the string below it.
-    """
+    """Settings of a fit: the sizes of the feature maps (table 3 of the paper) and the training. Each field is described
+    by the string below it."""
 
     FILES: ClassVar[str] = "lightmap"
 

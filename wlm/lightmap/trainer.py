@@ -56,10 +56,8 @@ class Targets:
         metric_weight: float,
         peak: float | None = None,
     ) -> None:
-        """Converts the valid texels of N tiles to gamma space, normalises and weights them.
-
-        `scale` [N, T, 3] and `affine` [N, 2, 3], which holds shift and spread, are float32, as rounded for the file.
-        """
+        """Converts the valid texels of N tiles to gamma space, normalises and weights them. `scale` [N, T, 3] and
+        `affine` [N, 2, 3], which holds shift and spread, are float32, as rounded for the file."""
         n, times = scale.shape[:2]
         self.number = tiles.index.astype(np.int32)
         self.scale = scale
@@ -133,10 +131,8 @@ class Trainer:
     """
 
     def __init__(self, profile: Profile, axis: TimeAxis, targets: Targets, seed: int, device: str, track: bool = False):
-        """Uploads the targets and draws the initial parameters.
-
-        The seed determines the initial parameters and all samples; `track` collects the errors that `psnr` needs.
-        """
+        """Uploads the targets and draws the initial parameters. The seed determines the initial parameters and all
+        samples; `track` collects the errors that `psnr` needs."""
         self._track = track
         self.axis, self.device = axis, device
         self.steps, self.frozen = profile.steps, round(profile.freeze_from * profile.steps)

@@ -111,11 +111,8 @@ class Views:
 
 
 def views_of(lightmaps: SheetFrames, count: int, device: str = "cpu") -> tuple[Views | None, list[str]]:
-    """Makes the `Views` of a sheet, from the mesh that the sheet names.
-
-    Returns None without a mesh that can be read or with a count of 0; and the warnings: one line if the mesh cannot be
-    read, else none.
-    """
+    """Makes the `Views` of a sheet, from the mesh that the sheet names. Returns None without a mesh that can be read or
+    with a count of 0; and the warnings: one line if the mesh cannot be read, else none."""
     if count < 0:
         raise WlmError(f"views: expected at least 0, got {count}")
     if lightmaps.mesh is None or count == 0:

@@ -62,9 +62,7 @@ class Indoors:
 
 def indoors(position: np.ndarray, triangle: np.ndarray, *, metres: bool, device: str = "cpu") -> Indoors:
     """Finds the valid eye positions in a scene of positions float [V, 3], y up, and at least one triangle, int [F, 3].
-
-    The result is the same in every run. `metres` tells whether the unit is known to be the metre.
-    """
+    The result is the same in every run. `metres` tells whether the unit is known to be the metre."""
     device = check_device(device)
     corner = np.asarray(position, np.float64)[triangle]
     low, high = corner.min(axis=(0, 1)), corner.max(axis=(0, 1))

@@ -419,10 +419,8 @@ def _convert(where: str, values: np.ndarray, name: str, change: Callable[[np.nda
 
 
 def _check(where: str, name: str, raw: _Raw, convention: str | None, order: str | None) -> ProbeSet:
-    """Checks the content of a file and returns it as a set, repaired where possible.
-
-    `convention` and `order` are those that the caller states.
-    """
+    """Checks the content of a file and returns it as a set, repaired where possible. `convention` and `order` are those
+    that the caller states."""
     position, key, beside = _check_positions(where, raw.position), raw.key, raw.beside
     count, values = len(position), raw.values[0]
     for hour in raw.values:

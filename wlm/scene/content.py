@@ -42,10 +42,8 @@ class Moving:
     seconds: float
 
     def pose(self, second: float) -> np.ndarray:
-        """Returns the transform from the mesh to the scene at a second of the film, float64 [4, 4].
-
-        The mesh turns at once at a corner of the path, and stays upright on a slope.
-        """
+        """Returns the transform from the mesh to the scene at a second of the film, float64 [4, 4]. The mesh turns at
+        once at a corner of the path, and stays upright on a slope."""
         steps = np.roll(self.path, -1, 0) - self.path
         ends = np.cumsum(np.linalg.norm(steps, axis=1))
         at = second / self.seconds % 1.0 * ends[-1]

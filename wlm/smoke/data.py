@@ -440,10 +440,8 @@ def read_six_way(path: str | os.PathLike[str], device: str = "cpu") -> SixWay:
 def read_shaded(
     path: str | os.PathLike[str], device: str = "cpu", notes: list[str] | None = None
 ) -> tuple[SixWay, Looks | None]:
-    """Reads the lightmaps that `write_six_way` wrote and, if present, the scene's lights, colours and obstacles.
-
-    A file of another program is read as by `read_flipbook`, which adds its assumptions to `notes`.
-    """
+    """Reads the lightmaps that `write_six_way` wrote and, if present, the scene's lights, colours and obstacles. A file
+    of another program is read as by `read_flipbook`, which adds its assumptions to `notes`."""
     if is_foreign(Path(path)):
         (six,) = read_flipbook([path], notes=notes, device=device)
         return six, None

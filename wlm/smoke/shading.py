@@ -138,10 +138,8 @@ def checked_albedo(albedo: Sequence[float]) -> np.ndarray:
 
 
 def in_voxels(light: AnyLight, volume: DensityVolume) -> tuple[np.ndarray, np.ndarray, float | None]:
-    """Returns a light in a volume's voxel coordinates: direction or position, irradiance / (4 pi), and radius.
-
-    The irradiance of a point light is that at a distance of one voxel. The radius of a directional light is None.
-    """
+    """Returns a light in a volume's voxel coordinates: direction or position, irradiance / (4 pi), and radius. The
+    irradiance of a point light is that at a distance of one voxel. The radius of a directional light is None."""
     if isinstance(light, Light):
         return unit(light.toward), checked_colour("irradiance", light.irradiance) / (4.0 * math.pi), None
     place = (np.asarray(light.position, np.float64) - np.asarray(volume.origin, np.float64)) / volume.voxel

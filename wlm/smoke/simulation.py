@@ -192,10 +192,8 @@ def _covers(body: Body, edge: float, places: np.ndarray, time: float) -> np.ndar
 
 
 def volume_of(scene: Scene, solver: fluid.Solver, *, kelvin: bool = False) -> DensityVolume:
-    """Returns the solver's smoke, in the solver's memory if there are no bricks, and valid until the next step.
-
-    The temperature of fire becomes the light of black bodies or, with `kelvin`, kelvins.
-    """
+    """Returns the solver's smoke, in the solver's memory if there are no bricks, and valid until the next step. The
+    temperature of fire becomes the light of black bodies or, with `kelvin`, kelvins."""
     smoke, grid = scene.smoke, scene.grid
     volume = solver.frame(extinction=smoke.extinction, emission=smoke.emission, cell=grid.cell, origin=grid.origin)
     if smoke.fire is None:
@@ -308,9 +306,7 @@ def _steps_per_frame(scene: Scene, solver: fluid.Solver) -> int:
 
 def _frame_steps(scene: Scene, solver: fluid.Solver, frame: int) -> Iterator[bool]:
     """Advances a solver to the end of a frame, by one or a few steps at a time; yields after them whether it is there.
-
-    The time step is halved while air is faster than `_FAST`.
-    """
+    The time step is halved while air is faster than `_FAST`."""
     every = max(_LOOK // solver.substeps, 1)
     count, longest = _steps_per_frame(scene, solver), scene.steps // solver.substeps
     step = solver.steps - (frame - 1) * count

@@ -55,10 +55,8 @@ class Canvas:
         shape: bool = False,
         one_sided: bool = False,
     ) -> None:
-        """Draws triangles with vertex colours, uint8 [V, 3]; the other arguments are those of `textured`.
-
-        With `shape` a light at the camera shades the mesh.
-        """
+        """Draws triangles with vertex colours, uint8 [V, 3]; the other arguments are those of `textured`. With `shape`
+        a light at the camera shades the mesh."""
         drawn = self._drawn.get((panel, name))
         if drawn is not None and len(drawn[1].points) == len(position) and drawn[1].n_cells == len(triangle):
             mesh = drawn[1]

@@ -133,11 +133,8 @@ class _Clock:
 
 
 def write_all(frames: Iterator[Frame], write: Callable[[int, np.ndarray], None]) -> tuple[dict[str, list[float]], bool]:
-    """Passes each frame of `run` to `write`, a function of its number and its pixels.
-
-    Returns the durations of each stage, "writing" among them, one for each frame that had the stage; and whether any
-    frame has smoke.
-    """
+    """Passes each frame of `run` to `write`, a function of its number and its pixels. Returns the durations of each
+    stage, "writing" among them, one for each frame that had the stage; and whether any frame has smoke."""
     smoke = False
     seconds: dict[str, list[float]] = {}
     for frame in frames:

@@ -165,11 +165,8 @@ class _LightmapScene(SurfaceScene):
 def atlas_scene(
     model: AtlasModel, original: np.ndarray | None = None, *, title: str, flat: bool = False, up: int = 1
 ) -> SurfaceScene:
-    """Makes the scene of a mesh under its lightmap: the first sheet of a model in its first state.
-
-    `original`, [H, W, 3], is the lightmap that was compressed, shown beside the decoded one; `flat` shows the lightmap
-    unwrapped.
-    """
+    """Makes the scene of a mesh under its lightmap: the first sheet of a model in its first state. `original`, [H, W,
+    3], is the lightmap that was compressed, shown beside the decoded one; `flat` shows the lightmap unwrapped."""
     sheet = model.scene.sheets[0]
     height, width = sheet.mask.shape
     shape = Geometry(sheet.position.astype(np.float32), sheet.triangle[sheet.active].astype(np.uint32), sheet.uv)

@@ -104,8 +104,7 @@ def strength(region: Region, p: wp.vec3i) -> float:
 def source_kernels(stored: type) -> dict[str, wp.Kernel]:
     """Builds (once) the kernels for smoke stored as `wp.float32` or `wp.float16`, by their names: "source" has a thread
     for each fine cell of a box, "cover" some for each coarse cell, "lift" one for each of a slab, "store" for each cell
-    of a brick and group.
-    """
+    of a brick and group."""
     fields_type = fields_struct(stored)
 
     @wp.func

@@ -105,8 +105,7 @@ def burn_kernel(stored: type) -> wp.Kernel:
 def burn(box: Box, walls: wp.array, bricks: Bricks, fire: Burning, clock: wp.array, fields: Fields, growth, slab: Slab):
     """Burns the fuel of a slab's smoke and cools it; writes to `growth`, float [coarse cells], how much the gas of a
     cell expands in a step of the lattice, as a share. `clock` is that of `lattice.step_kernel`; for others see
-    `advection`.
-    """
+    `advection`."""
     inputs = [box, walls, bricks, fire, clock]
     outputs = [fields.arrays, fields.burning.arrays, growth]
     kernel = burn_kernel(fields.density.dtype)

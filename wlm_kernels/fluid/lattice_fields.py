@@ -31,8 +31,7 @@ class FluidKernels:
     """Kernels for one lattice and storage type, with one thread per cell: `fields` computes the density minus 1 and the
     velocity in a slab, `start` sets the equilibrium of given ones; for each cell that becomes fluid, `neighbours`
     computes the means of the fluid around it, and `uncover` sets the equilibrium of these; `convert` converts all cells
-    to another time step, in place; `unpack` copies a population that has left the cells.
-    """
+    to another time step, in place; `unpack` copies a population that has left the cells."""
 
     fields: wp.Kernel
     start: wp.Kernel

@@ -80,8 +80,7 @@ class Links:
 class LinkKernels:
     """Kernels for one lattice and storage type, with one thread per link: `values` computes the value of each link (its
     number of threads is a multiple of `BLOCK`, as that of `bounce`), then `write` writes these into the populations;
-    `force` sums the force of the fluid on each body. `bounce` has one thread per cell of a body's window.
-    """
+    `force` sums the force of the fluid on each body. `bounce` has one thread per cell of a body's window."""
 
     values: wp.Kernel
     write: wp.Kernel

@@ -41,10 +41,8 @@ class VelocitySet:
 
 
 def _make(name: str, axes: int, weights: tuple[float, ...]) -> VelocitySet:
-    """Makes the set of all velocities with components -1, 0 and 1 whose squared length is below len(weights).
-
-    A velocity of squared length k has the weight weights[k].
-    """
+    """Makes the set of all velocities with components -1, 0 and 1 whose squared length is below len(weights). A
+    velocity of squared length k has the weight weights[k]."""
     signs = itertools.product(*[(-1, 0, 1) if a < axes else (0,) for a in range(3)])
     half = [c for c in signs if c > (0, 0, 0) and sum(map(abs, c)) < len(weights)]
     half.sort(key=lambda c: (sum(map(abs, c)), c))

@@ -66,10 +66,8 @@ def pack_biases(hidden: np.ndarray) -> np.ndarray:
 
 
 def _operands(weights: np.ndarray) -> np.ndarray:
-    """Arranges the weights of a layer, [N, inputs, units], as right operands of products, uint32 [N, words].
-
-    A lane holds of 16 inputs and 8 units the inputs 2 q, 2 q + 1, 2 q + 8, 2 q + 9 of unit g; see `matrix_units.cuh`.
-    """
+    """Arranges the weights of a layer, [N, inputs, units], as right operands of products, uint32 [N, words]. A lane
+    holds of 16 inputs and 8 units the inputs 2 q, 2 q + 1, 2 q + 8, 2 q + 9 of unit g; see `matrix_units.cuh`."""
     n, inputs, units = weights.shape
     parts = weights.reshape(n, inputs // STEP, 2, 4, 2, units // 8, 8).transpose(0, 1, 5, 6, 3, 2, 4)
     return np.ascontiguousarray(parts, np.float16).reshape(n, -1).view(np.uint32)

@@ -78,10 +78,8 @@ def _sum_of_group(x: wp.vec4, size: int) -> wp.vec4:
 
 @functools.cache
 def page_kernel(hidden: int) -> wp.Kernel:
-    """Builds (once) the kernel that decodes squares of texels, for networks of one hidden width, a multiple of 16.
-
-    The two arrays of the networks are those of `matrix_network.pack_biases` and `pack_networks`. GELU is its tanh form.
-    """
+    """Builds (once) the kernel that decodes squares of texels, for networks of one hidden width, a multiple of 16. The
+    two arrays of the networks are those of `matrix_network.pack_biases` and `pack_networks`. GELU is its tanh form."""
     evaluate, vec_hidden = matrix_texels(hidden), wp.types.vector(hidden, float)
 
     @wp.func

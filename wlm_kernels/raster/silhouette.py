@@ -195,9 +195,6 @@ def find(clip, triangle, sides, group, visible, depth, offset, edge) -> None:
 
 def find_backward(clip, triangle, edge, grad_offset, grad_clip) -> None:
     """Adds the gradient of the vertices, float [B, V, 4], z without any, from that of the offsets that `find` returns,
-    float [B, H, W, 2].
-
-    On CUDA crossings are added in any order, so that the last bits change from run to run.
-    """
+    float [B, H, W, 2]. On CUDA crossings are added in any order, so that the last bits change from run to run."""
     inputs = [clip, triangle, frame(*edge.shape[1:3], "clip"), edge, grad_offset]
     wp.launch(_find_backward, edge.shape, inputs=inputs, outputs=[grad_clip], device=clip.device)

@@ -140,8 +140,7 @@ def _decode(
 def decode(planes: wp.array, out: wp.array) -> None:
     """Decodes the network's output, float [PLANES, H, W], six lights in sRGB, opacity, and emission e as e / (1 + e) in
     sRGB, into six lights, transparency, and emission, at most the largest half float. Values outside the range of an
-    image are clamped to it; NaN stays NaN.
-    """
+    image are clamped to it; NaN stays NaN."""
     wp.launch(_decode, planes.shape[1:], inputs=[planes], outputs=[out], device=planes.device)
 
 

@@ -71,10 +71,8 @@ def asset_name(name: str) -> str:
 
 
 def godot_uniforms(text: str, *, mips: bool = False) -> str:
-    """Rewrites the texture declarations of our GLSL in Godot's shading language.
-
-    Integer textures become float textures, which hold their numbers exactly. With `mips` the filter reads mip levels.
-    """
+    """Rewrites the texture declarations of our GLSL in Godot's shading language. Integer textures become float
+    textures, which hold their numbers exactly. With `mips` the filter reads mip levels."""
     hints = f"filter_linear{'_mipmap' * mips}, repeat_disable"
     integer = [match[1] for match in _SAMPLER.finditer(text) if match[2] == "usampler2D"]
 

@@ -45,9 +45,7 @@ def lightmap_page(
     progress: OnProgress | None = None,
 ) -> Page:
     """Makes the HTML page of a lightmap model's first layer of light, the sum of its light groups, each with a slider.
-
-    For the arguments see `make_page`; `original` is a set with the same groups, or a bake of all lights together.
-    """
+    For the arguments see `make_page`; `original` is a set with the same groups, or a bake of all lights together."""
     whole, file_bytes = load_model(paths[0], "lightmap"), paths[0].stat().st_size
     sheet = first_light(whole.sheets)
     groups = whole.maps(sheet)

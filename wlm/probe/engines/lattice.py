@@ -125,12 +125,11 @@ def lattice_kit(
         axes: str | None = None,
         device: str = "cpu",
     ) -> dict[str, Any]:
-        """Writes second-order spherical harmonics at the centres of cubic cells that fill the probes' box.
-
-        There are `cells` cells along its longest side, 1 to the engine's limit. `original` is the file that was
-        compressed, required if the decoder needs positions and the model stores none. `axes` are the scene's axes that
-        become the engine's (`wlm.probe.axes`). Raises a WlmError if a probe has other than 9 coefficients, `cells` is
-        out of range, the light exceeds the range of the engine's numbers, or the device does not exist."""
+        """Writes second-order spherical harmonics at the centres of cubic cells that fill the probes' box. There are
+        `cells` cells along its longest side, 1 to the engine's limit. `original` is the file that was compressed,
+        required if the decoder needs positions and the model stores none. `axes` are the scene's axes that become the
+        engine's (`wlm.probe.axes`). Raises a WlmError if a probe has other than 9 coefficients, `cells` is out of
+        range, the light exceeds the range of the engine's numbers, or the device does not exist."""
         lattice = lattice_of(bundle.model.at(), cells, most, positions_of(bundle.model, original), device, axes)
         document = {"format": form, "version": 1, "about": about, "name": lattice.name}
         document |= {"resolution": lattice.count.tolist()}

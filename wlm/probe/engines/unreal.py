@@ -41,10 +41,8 @@ _ABOUT = (
 
 
 def _write(folder: Path, lattice: Lattice, values: np.ndarray) -> dict[str, Any]:
-    """Writes seven volume textures in Unreal's packing, and a reader, `WlmProbes.usf`.
-
-    A coefficient beyond the bound of non-negative light is clamped, and a negative ambient colour becomes 0.
-    """
+    """Writes seven volume textures in Unreal's packing, and a reader, `WlmProbes.usf`. A coefficient beyond the bound
+    of non-negative light is clamped, and a negative ambient colour becomes 0."""
     corner, size = lattice.low, lattice.count * lattice.size
     sh = from_canonical(values.reshape(-1, 9, 3).astype(np.float64), "unreal")
     if not np.abs(sh[:, 0]).max() <= _PACKED_MAX.min():

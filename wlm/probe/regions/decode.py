@@ -22,11 +22,8 @@ MEMORY = 256 << 20
 
 
 class RegionDecoder(PointDecoder):
-    """A model in regions on a device.
-
-    Regions are read from the file when they are needed first, and leave the device when others need their memory, the
-    least recently needed ones first.
-    """
+    """A model in regions on a device. Regions are read from the file when they are needed first, and leave the device
+    when others need their memory, the least recently needed ones first."""
 
     def __init__(
         self, model: ProbeModel, device: str = "cpu", *, position: np.ndarray | None = None, most_bytes: int = MEMORY

@@ -264,11 +264,8 @@ def _layout(
 
 def _best(frames: Sequence[torch.Tensor], others: Sequence[Layout]) -> tuple[str | None, float, float]:
     """Finds the layout whose directions fit the light of two textures [N, C, H, W]. Besides the known layouts, the
-    variants of `others` with two opposite directions exchanged are tried.
-
-    Returns its text for `parse_layout`, None if no layout fits; how well it fits; and how well the first of `others`
-    does.
-    """
+    variants of `others` with two opposite directions exchanged are tried. Returns its text for `parse_layout`, None if
+    no layout fits; how well it fits; and how well the first of `others` does."""
     counts = [each.shape[1] for each in frames]
     centres = light_centres(torch.cat(list(frames), 1))
     tried = [*LAYOUTS.values()]
@@ -316,9 +313,7 @@ def _straight(
 
 def _is_straight(maps: torch.Tensor, alpha: torch.Tensor) -> bool | None:
     """Tells straight from premultiplied alpha by lightmaps [N, 6, H, W] and opacity [N, H, W]; None: it can't be told.
-
-    Premultiplied light fades with the opacity, straight light does not.
-    """
+    Premultiplied light fades with the opacity, straight light does not."""
     bright, alpha = maps.amax(1).flatten(), alpha.flatten()
     bare = bright[alpha <= _BARE]
     if len(bare) and float(bare.mean()) > _LIT:

@@ -38,10 +38,8 @@ def smoke_shader(book: Book) -> str:
 
 
 def billboard_shader(book: Book) -> str:
-    """Returns the code of a shader that plays and lights a flip book on a billboard.
-
-    Its textures are `wlm_smoke_first_map` and `wlm_smoke_second_map`.
-    """
+    """Returns the code of a shader that plays and lights a flip book on a billboard. Its textures are
+    `wlm_smoke_first_map` and `wlm_smoke_second_map`."""
     textures = "\n".join(sampler(f"wlm_smoke_{name}_map", "sampler2D") for name in book.pages)
     text = filled(
         __package__,

@@ -34,11 +34,9 @@ def warp(earlier: torch.Tensor, motion: torch.Tensor) -> tuple[torch.Tensor, tor
 
 
 class _Bilinear(torch.autograd.Function):
-    """Samples images [N, C, H, W] bilinearly at given rows and columns [N, H', W']; returns [N, C, H', W'].
-
-    Several pixels can read the same pixel. On a GPU, torch's gradient adds up in any order, so that a training would
-    not repeat to the bit; this gradient adds integers instead. Rows and columns get no gradient.
-    """
+    """Samples images [N, C, H, W] bilinearly at given rows and columns [N, H', W']; returns [N, C, H', W']. Several
+    pixels can read the same pixel. On a GPU, torch's gradient adds up in any order, so that a training would not repeat
+    to the bit; this gradient adds integers instead. Rows and columns get no gradient."""
 
     @staticmethod
     def forward(ctx, image, row, column):

@@ -85,10 +85,8 @@ class _Norm(torch.autograd.Function):
 
 
 class NafBlock(nn.Module):
-    """Network layers that add two corrections to their input: one mixes neighbouring pixels, one mixes channels.
-
-    Before training both corrections are 0. The block has 7 c^2 + 33 c parameters for c channels.
-    """
+    """Network layers that add two corrections to their input: one mixes neighbouring pixels, one mixes channels. Before
+    training both corrections are 0. The block has 7 c^2 + 33 c parameters for c channels."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()

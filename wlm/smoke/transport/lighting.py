@@ -105,10 +105,8 @@ def _add(image: torch.Tensor, planes: torch.Tensor, colour: Sequence[float] | np
 
 
 def fine_march(volume: DensityVolume, g: float = 0.0) -> March:
-    """Returns settings of a march with an error of about 0.5%.
-
-    Its step is at most a voxel, and at most an optical depth of 0.1 in the densest smoke, but at least 1/4 voxel.
-    """
+    """Returns settings of a march with an error of about 0.5%. Its step is at most a voxel, and at most an optical
+    depth of 0.1 in the densest smoke, but at least 1/4 voxel."""
     densest = float(volume.density.max()) * volume.extinction * volume.voxel
     return March(step=min(max(_CLOSE / max(densest, 1e-30), _FINEST), 1.0), jitter=0.0, g=g)
 
