@@ -13,7 +13,8 @@ from typing import Any
 import warp as wp
 
 from wlm_kernels.lightmap.decode import Stored, TimeState
-from wlm_kernels.lightmap.matrix_network import STEP, native, packed_words, powers
+from wlm_kernels.lightmap.features import powers
+from wlm_kernels.lightmap.matrix_network import STEP, native, packed_words
 from wlm_kernels.native import native_source, on_cuda
 from wlm_kernels.shared_exponent import pack_rgb9e5
 

@@ -31,7 +31,7 @@ def fraction(coordinate: float, size: int) -> float:
 def axis_index(i: int, size: int, periodic: int) -> int:
     """Clamps an index to the border, or wraps it (i is at most one period outside)."""
     if periodic != 0:
-        return (i + size) % size
+        return wp.where(i < 0, i + size, wp.where(i < size, i, i - size))
     return wp.clamp(i, 0, size - 1)
 
 

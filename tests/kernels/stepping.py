@@ -84,7 +84,7 @@ class Case:
 
 
 def trainer(case: Case, device: str, seed: int = 3, spread: bool = True) -> Trainer:
-    """A trainer; with `spread` its maps and networks are random with values out of range, not the initial ones."""
+    """A trainer; with `spread` its maps and networks are random, not the initial ones."""
     result = Trainer(case.profile(), case.axis(), case.targets(), seed, device)
     if spread:
         for key, values in _clear_values(result).items():
@@ -100,7 +100,7 @@ def _clear_values(trainer: Trainer) -> dict[str, np.ndarray]:
     """Random maps near levels that can be stored, so that float32 and float64 round to the same level.
 
     A value half-way between two levels may be rounded either way, and one such value would be an error of a whole
-    level against the reference. One in thirty weights and plane values lies out of range.
+    level against the reference. Some values are 0 or 1.
     """
     random = np.random.default_rng(7)
     result = {}
@@ -110,10 +110,7 @@ def _clear_values(trainer: Trainer) -> dict[str, np.ndarray]:
         base = random.integers(0, levels + 1, shape)
         if key.endswith("endpoints"):
             base = base // 2 * 2 + random.integers(0, 2, (*shape[:-1], 1))  # one lowest bit for four channels
-        values = (base + random.uniform(-0.3, 0.3, shape)) / levels
-        if not key.endswith("endpoints"):
-            values += (random.random(shape) < 1 / 60) * 1.3 - (random.random(shape) < 1 / 60) * 1.3
-        result[key] = values.astype(np.float32)
+        result[key] = ((base + random.uniform(-0.3, 0.3, shape)) / levels).clip(0.0, 1.0).astype(np.float32)
     return result
 
 
@@ -123,9 +120,10 @@ def draw(trainer: Trainer, quantised: bool) -> tuple[np.ndarray, np.ndarray]:
     shape = (trainer.tiles, samples)
     with interop.stream(trainer.device):
         trainer.batch.quantised = int(quantised)
+        trainer._round()
         place = wp.zeros(shape, dtype=wp.vec3i, device=trainer.device)
         features = wp.zeros(shape, dtype=kernels.net.vec_in, device=trainer.device)
-        inputs, outputs = [trainer._maps, trainer.batch, samples], [place, features]
+        inputs, outputs = [trainer._maps[quantised], trainer.batch, samples], [place, features]
         wp.launch(kernels.draw, shape, inputs=inputs, outputs=outputs, device=trainer.device)
     return place.numpy(), features.numpy()
 

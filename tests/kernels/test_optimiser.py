@@ -22,10 +22,8 @@ def _share(step: int, steps: int, final: float) -> float:
 
 
 def test_gather_clears_clamps_and_counts(device: str):
-    """After a step the sums are 0, the maps that the optimiser moved were within [0, 1], and the step is counted."""
+    """After a step the sums are 0, maps that the optimiser moved are within [0, 1], and the step is counted."""
     fit = trainer(Case(settings=RATES | {"steps": 12}), device)
-    start = fit.maps.clone()
-    assert float(start.min()) < 0.0 and float(start.max()) > 1.0
     for step in range(14):
         assert fit.step == step
         before = fit.maps.clone()
@@ -33,13 +31,13 @@ def test_gather_clears_clamps_and_counts(device: str):
         share = _share(min(step, 11), 12, 0.1)  # beyond the last step its rate stays
         want = [0.02 * share, 0.005 * share]
         np.testing.assert_allclose(fit._rates[:2].cpu().numpy(), want, rtol=1e-5, err_msg=f"step {step}")
-        # Adam moves a value by hardly more than its rate, from where gather has put it.
-        moved = (fit.maps - before.clamp(0.0, 1.0)).abs()
-        assert float(moved.max()) < 0.02 * share * 4.0
+        # Adam moves a value by hardly more than its rate.
+        assert float((fit.maps - before).abs().max()) < 0.02 * share * 4.0
+        assert float(fit.maps.min()) == 0.0 and float(fit.maps.max()) == 1.0
         if step == 0:
             for key, view in fit.views.items():
                 at = before.storage_offset() + view.storage_offset()
-                start = before[at : at + view.numel()].view(view.shape).clamp(0, 1).cpu().numpy()
+                start = before[at : at + view.numel()].view(view.shape).cpu().numpy()
                 still = grads[key] == 0
                 np.testing.assert_array_equal(view.cpu().numpy()[still], start[still])
         assert not fit._acc.cpu().numpy().any()
@@ -59,14 +57,14 @@ def test_adam_is_torchs(device: str):
     for step in range(20):
         grads = fused_step(fit, step >= 10).grads
         maps = np.concatenate([grads[key].ravel() for key in fit.views])
-        with torch.no_grad():
-            whole[0].clamp_(0.0, 1.0)
         share = _share(step, 20, 0.1)
         for group, rate in zip(adam.param_groups, (0.02, 0.005), strict=True):
             group["lr"] = rate * share
         for value, grad in zip(whole, (maps, grads["hidden"], grads["output"]), strict=True):
             value.grad = torch.from_numpy(grad).double()
         adam.step()
+        with torch.no_grad():
+            whole[0].clamp_(0.0, 1.0)
     for name, value, mine in zip(("maps", "hidden", "output"), whole, named, strict=True):
         close(mine, value, 2e-5, name)
     fit.close()
@@ -99,15 +97,15 @@ def test_muon_moves_layers_along_their_orthogonal_momentum(device: str, hidden: 
     rates = array(np.array([[7.0, 0.5, 7.0, 7.0]], np.float32), wp.vec4, device)
     gather.turn(hidden, rates, array(momentum.astype(np.float32).ravel(), float, device), weights)
     want = np.stack([_turn(each, 0.5) for each in momentum.astype(np.float32)])
-    # A GPU's operands are half floats.
+    # A GPU's operands are half floats, whose errors in directions without momentum the iteration multiplies by 480.
     moved = weights.numpy().reshape(start.shape) - start
-    np.testing.assert_allclose(moved, want, atol=2e-5 if device == "cpu" else 0.01)
+    np.testing.assert_allclose(moved, want, atol=2e-5 if device == "cpu" else 0.03)
     fit = trainer(Case(hidden=hidden, settings={"muon": True, "net_rate": 0.01}), device)
     start = fit.hidden.cpu().numpy().copy()
     grads = fused_step(fit, False).grads["hidden"]
     want, biases = np.stack([_turn(each, 0.01) for each in grads]), np.s_[:, [INPUTS, INPUTS + 1 + hidden]]
     want[biases] = -0.01 * grads[biases] / (np.abs(grads[biases]) + 1e-8)
-    np.testing.assert_allclose(fit.hidden.cpu().numpy() - start, want, atol=1e-6 if device == "cpu" else 2e-4)
+    np.testing.assert_allclose(fit.hidden.cpu().numpy() - start, want, atol=1e-6 if device == "cpu" else 6e-4)
     fit.close()
 
 
@@ -118,13 +116,12 @@ def test_integer_sums_are_those_of_floats(device: str):
     rates, control = array(np.array([[0.02, 0.01, 10.0, 10.0]], np.float32), wp.vec4, device), array([0], int, device)
     none = [wp.zeros((1, 0), dtype=float, device=device), gather.Adam(), wp.zeros(0, dtype=float, device=device)]
     for scalar, stored in ((float, sums), (wp.int64, np.round(sums * 2.0**40).astype(np.int64))):
-        adam, maps, acc = gather.Adam(), array(values, float, device), array(stored[None], scalar, device)
+        adam, maps, acc = gather.Adam(), features.Maps(), array(stored[None], scalar, device)
+        maps.values = array(values, float, device)
         adam.decay, adam.epsilon = wp.vec2(0.9, 0.99), 1e-8
         adam.first, adam.second = (array(np.zeros_like(values), float, device) for _ in range(2))
-        gather.update(
-            rates, features.Offsets(), acc, adam, maps, *none, *none, none[0], none[2], control, maps, clear=True
-        )
-        results.append([maps.numpy(), adam.first.numpy(), adam.second.numpy()])
+        gather.update(rates, acc, adam, maps, *none, *none, none[0], none[2], control, maps.values, clear=True)
+        results.append([maps.values.numpy(), adam.first.numpy(), adam.second.numpy()])
         assert not acc.numpy().any()
     for floats, integers in zip(*results, strict=True):
         np.testing.assert_allclose(integers, floats, rtol=1e-6)

@@ -2,11 +2,10 @@
 
 import numpy as np
 import pytest
-import warp as wp
 
 from kernels.compare import close
 from kernels.stepping import TILE, Case, Problem, Trainer, draw, drawn_noise, fused_step, problem, tolerance, trainer
-from wlm_kernels.lightmap import blocks, matrix_step
+from wlm_kernels.lightmap import matrix_step
 
 # One width in the quick run, since each compiles kernels of its own. Matrix units of a GPU have no odd ones.
 WIDTHS = [pytest.param(width, marks=[] if width == 16 else pytest.mark.slow) for width in (16, 17, 32, 64)]
@@ -125,7 +124,7 @@ def test_two_lanes_equal_one():
     lanes = fused_step(double, False)
     sums = acc, partial, partial_out, loss = single._launch_sums
     networks = single._nets[0]
-    single._kernels.launch(single._maps, single._offsets, *networks, single.batch, case.samples, *sums, 0, case.samples)
+    single._kernels.launch(single._maps[0], *networks, single.batch, case.samples, *sums, 0, case.samples)
     flat = np.concatenate([grad.ravel() for key, grad in lanes.grads.items() if key in single.views])
     assert not acc.numpy()[1].any()
     close(flat, acc.numpy()[0], 1e-6, "maps")
@@ -134,16 +133,3 @@ def test_two_lanes_equal_one():
     close(lanes.loss, loss.numpy()[0], 1e-5, "loss")
     single.close()
     double.close()
-
-
-def test_maps_that_were_rounded_once(device: str):
-    """Endpoints and weights on the file's levels, read as such, are the texels that rounding at each read gives."""
-    random = np.random.default_rng(0)
-    endpoints = wp.array(random.uniform(-0.1, 1.1, (3, 2, 4, 2, 4)).astype(np.float32), dtype=wp.vec4, device=device)
-    weights = wp.array(random.uniform(-0.1, 1.1, (3, 8, 16)).astype(np.float32), device=device)
-    rounded = wp.empty_like(endpoints), wp.empty_like(weights)
-    blocks.round_to_levels(endpoints, weights, *rounded)
-    expected, found = (wp.empty((3, 8, 16), dtype=wp.vec4, device=device) for _ in range(2))
-    blocks.reconstruct(endpoints, weights, expected, True)
-    wp.launch(blocks._reconstruct, (3, 8, 16), inputs=[*rounded, 2], outputs=[found], device=device)
-    np.testing.assert_array_equal(found.numpy(), expected.numpy())

@@ -40,6 +40,8 @@ is a quarter."""
 _MOST_STEPS = 2**31 - 1  # limit of the device's counter
 # Steps in a graph, a multiple of the period, and the least number of steps for which capturing one saves time.
 _GRAPH_STEPS, _GRAPH_FROM = 8, 16
+# Cells of a lattice with two arrays from which on a thread computes one cell.
+_PAIRED = 1 << 25
 # A mark of no cell in `Lattice._fresh`.
 _STALE = 3
 
@@ -145,8 +147,9 @@ class Lattice:
         self._set, self._tables = velocity_set(lattice), tables(lattice, str(self.device))
         size = (len(self._set.c), self._cells)
         # The settings for which the kernel of a step is specialised.
-        group = 2 if storage == "float16" and self.shape[2] % 2 == 0 else 1
-        self._spec = replace(spec, wide=math.prod(size) > NARROW, group=group)
+        # In two arrays, two cells a thread are slower at 400^3 (docs/notes/fluid-speed.md).
+        paired = storage == "float16" and self.shape[2] % 2 == 0 and (save_memory or self._cells < _PAIRED)
+        self._spec = replace(spec, wide=math.prod(size) > NARROW, group=2 if paired else 1)
         self._arrays = [self._zeros(size, STORAGES[storage][0]) for _ in range(1 if save_memory else 2)]
         self._parity = 0  # of the clock and, in place, of the populations; else the array that has them
         # A ramp of one step is no ramp: inflow begins after it.

@@ -166,8 +166,8 @@ class Trainer:
             self._kernels.load(device)
             gather.load(device, self._turned)
         with interop.stream(device):
-            self._allocate(shapes, profile.hidden)
-            self._upload(targets, seed, profile.gamma, slices)
+            self._allocate(shapes, profile)
+            self._upload(targets, seed, profile.gamma)
             self.batch.schedule = self._rates_over_steps(profile.final_rate)
             self._draw(seed)
         repeated = (partial(self._step, stage, _REPEATS) for stage in range(3))
@@ -179,9 +179,11 @@ class Trainer:
             for graph in self._repeated:
                 graph.capture()
 
-    def _allocate(self, shapes: dict[str, tuple[int, ...]], hidden: int) -> None:
-        """Allocates maps of these shapes, networks of a hidden width, and all arrays that a training step writes."""
-        device, n = self.device, self.tiles
+    def _allocate(self, shapes: dict[str, tuple[int, ...]], profile: Profile) -> None:
+        """Allocates maps of these shapes, networks, and all arrays that a training step writes."""
+        device, n, hidden = self.device, self.tiles, profile.hidden
+        sizes = {"slices": profile.uvt_slices, "side": profile.uvt_resolution}
+        sizes |= {"rows": profile.plane_rows, "columns": profile.plane_columns}
         lengths = {key: math.prod(shape) for key, shape in shapes.items()}
         total = sum(lengths.values())
 
@@ -190,23 +192,18 @@ class Trainer:
 
         self.maps = zeros(total)
         self.hidden, self.output = zeros(n, INPUTS + hidden + 2, hidden), zeros(n, hidden + 1, 3)
+        self._rounded = zeros(total)  # the maps on the levels of the file, which a step reads once they are quantised
+        self._maps = [features.Maps() for _ in range(2)]
+        for maps, values in zip(self._maps, (self.maps, self._rounded), strict=True):
+            maps.values = interop.to_warp(values)
+            for key, size in sizes.items():
+                setattr(maps, key, size)
         self.views, at = {}, 0
-        self._offsets = features.Offsets()
         for key, shape in shapes.items():
             self.views[key] = self.maps[at : at + lengths[key]].view(shape)
-            setattr(self._offsets, key, at)
+            for maps in self._maps:
+                setattr(maps, key, at)
             at += lengths[key]
-        maps = features.Maps()
-        types = {"uv_endpoints": wp.vec4, "uvt_endpoints": wp.vec4, "ut": wp.vec2, "vt": wp.vec2}
-        for key, view in self.views.items():
-            setattr(maps, key, interop.to_warp(view, types.get(key, wp.float32)))
-        self._maps = maps
-        # The maps on the levels of the file, which a step reads once they are quantised.
-        self._rounded, rounded = features.Maps(), zeros(self._offsets.ut)
-        self._rounded.ut, self._rounded.vt = maps.ut, maps.vt
-        for key in ("uv_endpoints", "uv_weights", "uvt_endpoints", "uvt_weights"):
-            own = rounded[getattr(self._offsets, key) :][: lengths[key]].view(shapes[key])
-            setattr(self._rounded, key, interop.to_warp(own, types.get(key, wp.float32)))
 
         self._lanes = lanes = 1 if self._cuda else CPU_LANES
         parts = self._samples // lightmap_step.BLOCK if self._cuda else lanes
@@ -234,11 +231,11 @@ class Trainer:
         self._nets = [(wrap(values[0], vec), wrap(values[1], wp.vec3)) for values in (nets, self._on_levels)]
         self._levels_args = tuple(wrap(values) for values in (*nets, *self._on_levels))
         self._launch_sums = (wrap(self._acc), *shaped)
-        self._update_args: list = [self._wrapped_rates, self._offsets, self._launch_sums[0], adams[0], wrap(self.maps)]
+        self._update_args: list = [self._wrapped_rates, self._launch_sums[0], adams[0], self._maps[0]]
         self._turned_args = adams[1].first, wrap(self.hidden.view(-1))
         for sums, moments, values in zip((self._partial, self._partial_out), adams[1:], nets, strict=True):
             self._update_args += [wrap(sums.view(parts, -1)), moments, wrap(values.view(-1))]
-        self._update_args += [wrap(self._loss_parts), wrap(self.loss), wrap(self.control), wrap(rounded)]
+        self._update_args += [wrap(self._loss_parts), wrap(self.loss), wrap(self.control), self._maps[1].values]
 
     def _moments_of(self, name: str, values: torch.Tensor) -> gather.Adam:
         """Returns the state of the optimiser (Adam) for one array of parameters, with all moments 0."""
@@ -251,7 +248,7 @@ class Trainer:
             setattr(adam, field, interop.to_warp(moments))
         return adam
 
-    def _upload(self, targets: Targets, seed: int, gamma: float, slices: int) -> None:
+    def _upload(self, targets: Targets, seed: int, gamma: float) -> None:
         tau, encoding = encode_time(self.axis)
 
         def put(values: np.ndarray, dtype: type) -> wp.array:
@@ -274,7 +271,6 @@ class Trainer:
         self._scored = torch.from_numpy(targets.range > 0)
         batch.tracked = interop.to_warp(self._tracked)
         batch.control = interop.to_warp(self.control)
-        batch.slices = slices
         batch.seed = seed
         batch.emphasis = targets.emphasis
         batch.periodic = int(self.axis.periodic)
@@ -342,19 +338,17 @@ class Trainer:
             self._update(stage)
 
     def _round(self) -> None:
-        """Puts endpoints and weights on the levels of the file, for steps of quantised maps."""
+        """Puts the maps on the levels of the file, for steps of quantised maps."""
         with interop.alone:
-            for pair in (("uv_endpoints", "uv_weights"), ("uvt_endpoints", "uvt_weights")):
-                blocks.round_to_levels(*(getattr(each, name) for each in (self._maps, self._rounded) for name in pair))
+            gather.put_on_levels(*self._maps)
 
     def _add_gradients(self, stage: int) -> None:
         quantised = stage > 0
-        self.batch.quantised, self.batch.frozen = 2 * quantised, int(stage == 2)
+        self.batch.quantised, self.batch.frozen = int(quantised), int(stage == 2)
         on_levels = quantised and self._integers
         if on_levels:
             levels.put_on_levels(*self._levels_args)
-        maps, nets = self._rounded if quantised else self._maps, self._nets[on_levels]
-        args = (maps, self._offsets, *nets, self.batch, self._samples, *self._launch_sums)
+        args = (self._maps[quantised], *self._nets[on_levels], self.batch, self._samples, *self._launch_sums)
         span = self._samples // self._lanes
         self._share(lambda lane: self._kernels.launch(*args, lane * span, span))
 
@@ -403,7 +397,8 @@ class Trainer:
 
     def _blocks(self, name: str) -> np.ndarray:
         """Returns a map as BC7 blocks, uint8 [S, H/4, W/4, 16]: S images of H x W texels, one per tile or slice."""
-        endpoints, weights = (getattr(self._maps, f"{name}_{part}") for part in ("endpoints", "weights"))
+        endpoints = interop.to_warp(self.views[f"{name}_endpoints"], wp.vec4)
+        weights = interop.to_warp(self.views[f"{name}_weights"])
         with interop.alone, interop.stream(self.device):
             levels = wp.empty(endpoints.shape, dtype=wp.vec4ub, device=self.device)
             index = wp.empty(weights.shape, dtype=wp.uint8, device=self.device)
@@ -451,6 +446,7 @@ class Trainer:
         with interop.stream(self.device):
             for key in _STATE:
                 getattr(self, key).copy_(values[key])
+            self.maps.clamp_(0.0, 1.0)  # as steps do; maps of version 0.2 may lie outside
             for key, moments in self._moments.items():
                 moments.copy_(values[key])
 

@@ -202,14 +202,13 @@ def step_kernel(spec: Spec) -> wp.Kernel:
             clock[1 - parity] = clock[parity] + 1
             for k in range(sums.shape[0]):
                 sums[k] = wp.float64(0.0)
-        # Populations of solid cells are read too: a test before it would wait for the memory.
-        arrived = gather(f, n, _ALL, i, parity)
         covered = int(0)
         if wp.static(spec.solids):
             for m in range(wp.static(group)):
                 covered += int(solid[i + m] != wp.uint8(0)) << m
             if covered == wp.static((1 << group) - 1):
                 return
+        arrived = gather(f, n, _ALL, i, parity)
         left = vec()  # 0 for solid cells, where nothing reads it
         for m in range(wp.static(group)):
             if (covered >> m) & 1 == 0:

@@ -12,160 +12,92 @@ from typing import Any
 import warp as wp
 
 from wlm_kernels.interpolate import axis_index, cell, fraction
-from wlm_kernels.lightmap.blocks import endpoint_at, ste_endpoint, ste_weight
-from wlm_kernels.lightmap.features import Maps, Offsets
+from wlm_kernels.lightmap.features import Cell, Maps, corner_weights, corners_at, four_at, uv_place
 from wlm_kernels.native import native_source
 
 
-@wp.func
-def corner_weights(first: int, second: int, f: float, block: int) -> wp.vec2:
-    """Returns the weights 1 - f and f of two texels along an axis; 0 for a texel outside the 4-texel block `block`."""
-    a = wp.where(first // 4 == block, 1.0 - f, 0.0)
-    b = wp.where(second // 4 == block, f, 0.0)
-    return wp.vec2(a, b)
-
-
-_Spread = wp.types.vector(8, float)
-
-# The lanes of a warp share their additions, so that neighbours in memory are added at once: 8 lanes add the endpoints
-# of one sample's block, then of another sample's. If each lane added its own sample, there would be one request to
-# memory for each number, rather than one for four.
-
-
-@wp.func_native(native_source(__package__, "spread_texels"))
-def _spread_texels(g: wp.vec4) -> _Spread:
-    """Redistributes g over a warp: component r of lane l's result is component l % 4 of g in lane 4 r + l / 8."""
-
-
-@wp.func_native(native_source(__package__, "add_endpoints"))
-def _add_endpoints(acc: wp.array2d[wp.int64], lane: int, at: int, a: float, b: float, g: _Spread):
-    """Adds a * g to the sums with the indices `at` to `at` + 3, and b * g to the next four; nothing if `at` < 0. All
-    lanes of a warp must call it together; their g comes from `_spread_texels`."""
-
-
-@wp.func_native(native_source(__package__, "add_cells"))
-def _add_cells(acc: wp.array2d[wp.int64], early: wp.vec2i, late: wp.vec2i, ft: float, v: wp.vec4):
-    """Adds two channels of each of two texels, `v`, to the texels' sums in two rows of a plane: times 1 - ft at the
-    indices `early`, times ft at `late`. All lanes of a warp must call it together."""
+@wp.func_native(native_source(__package__, "add_fours"))
+def _add_fours(acc: wp.array2d[wp.int64], row: int, first: int, second: int, a: float, b: float, g: wp.vec4):
+    """Adds a * g to the sums with the indices `first` to `first` + 3, and b * g to those from `second` on; nothing if
+    `first` < 0. All lanes of a warp must call it together; `row` is each lane's address in shared memory."""
 
 
 @wp.func
-def _spread_none(g: wp.vec4) -> wp.vec4:
-    return g
+def _joined(parts: wp.vec4, in_x: float, in_y: float) -> wp.vec4:
+    """Returns the sums for the blocks of four corners, along x first, of parts for the corners. `in_x` and `in_y` are 1
+    where corners along an axis have one block, the first one's, else 0."""
+    return wp.vec4(
+        parts[0] + in_x * parts[1] + in_y * parts[2] + in_x * in_y * parts[3],
+        parts[1] + in_y * parts[3],
+        parts[2] + in_x * parts[3],
+        parts[3],
+    )
 
 
 @functools.cache
 def _adders(device_kind: str) -> tuple[Any, ...]:
-    """Returns a function that adds a number, the type of the sums, a function that adds the gradient g to a block's two
-    endpoints, and a function that prepares g for it."""
+    """Returns a function that adds a number, the type of the sums, and a function like `_add_fours`."""
     if device_kind == "cuda":
         # Fixed point with steps of 2^-40, about 1e-12; a sum beyond 8e6 would overflow.
 
         @wp.func
         def add(acc: wp.array2d[wp.int64], lane: int, i: int, value: float):
-            wp.atomic_add(acc, lane, i, wp.int64(value * 1099511627776.0))
+            wp.atomic_add(acc, 0, i, wp.int64(value * 1099511627776.0))
 
-        return add, wp.int64, _add_endpoints, _spread_texels
+        return add, wp.int64, _add_fours
 
     @wp.func
     def add(acc: wp.array2d[float], lane: int, i: int, value: float):
         acc[lane, i] += value
 
     @wp.func
-    def add_endpoints(acc: wp.array2d[float], lane: int, at: int, a: float, b: float, g: wp.vec4):
-        if at >= 0:
+    def add_fours(acc: wp.array2d[float], lane: int, first: int, second: int, a: float, b: float, g: wp.vec4):
+        if first >= 0:
             for c in range(4):
-                add(acc, lane, at + c, a * g[c])
-                add(acc, lane, at + 4 + c, b * g[c])
+                add(acc, lane, first + c, a * g[c])
+                add(acc, lane, second + c, b * g[c])
 
-    return add, float, add_endpoints, _spread_none
+    return add, float, add_fours
 
 
 @functools.cache
 def scatters(device_kind: str) -> tuple[Any, Any, Any, Any]:
     """Builds (once) for "cpu" or "cuda" the functions that add a sample's gradients to the gradient sums of the feature
-    maps. Returns a `wp.func` for F_uv, one for F_uvt, one for the planes F_ut and F_vt, and the type of the sums."""
-    add, scalar, add_endpoints, spread = _adders(device_kind)
+    maps. Returns a `wp.func` for F_uv, one for F_uvt, one for the planes F_ut and F_vt, and the type of the sums. Their
+    `lane` is the number of the sums on the CPU, on CUDA a thread's row of shared memory from `matrix_step`."""
+    add, scalar, add_fours = _adders(device_kind)
 
     @wp.func
-    def scatter_texel(
-        acc: wp.array2d[scalar],
-        lane: int,
-        offsets: Offsets,
-        maps: Maps,
-        n: int,
-        y: int,
-        x: int,
-        quantised: int,
-        g: wp.vec4,
-    ):
-        width = maps.uv_weights.shape[2]
-        height = maps.uv_weights.shape[1]
-        e0 = ste_endpoint(endpoint_at(maps.uv_endpoints, n, y // 4, x // 4, 0), quantised)
-        e1 = ste_endpoint(endpoint_at(maps.uv_endpoints, n, y // 4, x // 4, 1), quantised)
-        w = ste_weight(maps.uv_weights[n, y, x], quantised)
-        add(acc, lane, offsets.uv_weights + (n * height + y) * width + x, wp.dot(e1 - e0, g))
-        block = (n * (height // 4) + y // 4) * (width // 4) + x // 4
-        add_endpoints(acc, lane, offsets.uv_endpoints + block * 8, 1.0 - w, w, spread(g))
+    def scatter_texel(acc: wp.array2d[scalar], lane: int, maps: Maps, n: int, flat: int, g: wp.vec4):
+        place = uv_place(maps, n, flat)
+        w = maps.values[place.weight]
+        along = four_at(maps.values, place.endpoints + 4) - four_at(maps.values, place.endpoints)
+        add(acc, lane, place.weight, wp.dot(along, g))
+        add_fours(acc, lane, place.endpoints, place.endpoints + 4, 1.0 - w, w, g)
 
     @wp.func
-    def scatter_volume(
-        acc: wp.array2d[scalar],
-        lane: int,
-        offsets: Offsets,
-        maps: Maps,
-        n: int,
-        slices: int,
-        u: float,
-        v: float,
-        tau: float,
-        periodic: int,
-        quantised: int,
-        g: wp.vec4,
-    ):
-        height = maps.uvt_weights.shape[1]
-        width = maps.uvt_weights.shape[2]
-        x = cell(u, width)
-        y = cell(v, height)
-        t = cell(tau, slices)
-        fx = fraction(u, width)
-        fy = fraction(v, height)
-        ft = fraction(tau, slices)
-        xa = axis_index(x, width, 0)
-        xb = axis_index(x + 1, width, 0)
-        ya = axis_index(y, height, 0)
-        yb = axis_index(y + 1, height, 0)
-        parts = spread(g)
+    def scatter_volume(acc: wp.array2d[scalar], lane: int, maps: Maps, n: int, cell: Cell, g: wp.vec4):
+        # The four corners of a slice lie in one to four blocks: endpoints get one sum per block, not per corner.
+        in_x = wp.where(cell.in_x, 1.0, 0.0)
+        in_y = wp.where(cell.in_y, 1.0, 0.0)
         two = int(2)  # rolled, as in volume_at
-        four = int(4)
         for k in range(two):
-            s = n * slices + axis_index(t + k, slices, periodic)
-            ct = wp.where(k == 0, 1.0 - ft, ft)
-            # The four corners of a slice lie in one to four blocks: endpoints get one sum per block, not per corner.
-            for j in range(two):
-                by = wp.where(j == 0, ya // 4, yb // 4)
-                for i in range(two):
-                    bx = wp.where(i == 0, xa // 4, xb // 4)
-                    at = int(-1)
-                    first = float(0.0)
-                    second = float(0.0)
-                    if (j == 0 or by != ya // 4) and (i == 0 or bx != xa // 4):
-                        cy = corner_weights(ya, yb, fy, by) * ct
-                        cx = corner_weights(xa, xb, fx, bx)
-                        e0 = ste_endpoint(endpoint_at(maps.uvt_endpoints, s, by, bx, 0), quantised)
-                        e1 = ste_endpoint(endpoint_at(maps.uvt_endpoints, s, by, bx, 1), quantised)
-                        along = wp.dot(e1 - e0, g)
-                        for q in range(four):
-                            c = cy[q // 2] * cx[q % 2]
-                            if c != 0.0:
-                                yy = wp.where(q // 2 == 0, ya, yb)
-                                xx = wp.where(q % 2 == 0, xa, xb)
-                                w = ste_weight(maps.uvt_weights[s, yy, xx], quantised)
-                                first += c * (1.0 - w)
-                                second += c * w
-                                add(acc, lane, offsets.uvt_weights + (s * height + yy) * width + xx, c * along)
-                        at = offsets.uvt_endpoints + ((s * (height // 4) + by) * (width // 4) + bx) * 8
-                    add_endpoints(acc, lane, at, first, second, parts)
+            s = n * maps.slices + wp.where(k == 0, cell.t[0], cell.t[1])
+            corners = corners_at(maps, s, cell)
+            weights = corner_weights(cell, k)
+            for q in range(4):
+                add(acc, lane, corners.weights[q], weights[q] * wp.dot(corners.high[q] - corners.low[q], g))
+            first = _joined(wp.cw_mul(weights, wp.vec4(1.0) - corners.w), in_x, in_y)
+            second = _joined(wp.cw_mul(weights, corners.w), in_x, in_y)
+            at = corners.endpoints
+            if cell.in_x:
+                at[1] = -1
+                at[3] = -1
+            if cell.in_y:
+                at[2] = -1
+                at[3] = -1
+            for q in range(4):
+                add_fours(acc, lane, at[q], at[q] + 4, first[q], second[q], g)
 
     if device_kind == "cuda":
 
@@ -173,24 +105,24 @@ def scatters(device_kind: str) -> tuple[Any, Any, Any, Any]:
         def scatter_plane(
             acc: wp.array2d[scalar],
             lane: int,
+            maps: Maps,
             offset: int,
-            rows: int,
-            columns: int,
             n: int,
             p: float,
             tau: float,
             periodic: int,
             g: wp.vec2,
         ):
-            x = cell(p, columns)
-            t = cell(tau, rows)
-            fx = fraction(p, columns)
-            cells = wp.vec2i(axis_index(x, columns, 0), axis_index(x + 1, columns, 0))
-            at = wp.vec2i(offset) + 2 * cells
-            early = wp.vec2i((n * rows + axis_index(t, rows, periodic)) * columns * 2)
-            late = wp.vec2i((n * rows + axis_index(t + 1, rows, periodic)) * columns * 2)
+            # Two neighbours of a row; beyond its last or before its first cell, the other one gets 0.
+            x = cell(p, maps.columns)
+            t = cell(tau, maps.rows)
+            place = wp.clamp(x, 0, wp.max(maps.columns - 2, 0))
+            fx = wp.clamp(p * float(maps.columns) - 0.5 - float(place), 0.0, wp.min(float(maps.columns) - 1.0, 1.0))
+            ft = fraction(tau, maps.rows)
+            early = offset + 2 * (maps.columns * (n * maps.rows + axis_index(t, maps.rows, periodic)) + place)
+            late = offset + 2 * (maps.columns * (n * maps.rows + axis_index(t + 1, maps.rows, periodic)) + place)
             v = wp.vec4((1.0 - fx) * g[0], (1.0 - fx) * g[1], fx * g[0], fx * g[1])
-            _add_cells(acc, at + early, at + late, fraction(tau, rows), v)
+            add_fours(acc, lane, early, late, 1.0 - ft, ft, v)
 
     else:
 
@@ -198,27 +130,25 @@ def scatters(device_kind: str) -> tuple[Any, Any, Any, Any]:
         def scatter_plane(
             acc: wp.array2d[scalar],
             lane: int,
+            maps: Maps,
             offset: int,
-            rows: int,
-            columns: int,
             n: int,
             p: float,
             tau: float,
             periodic: int,
             g: wp.vec2,
         ):
-            x = cell(p, columns)
-            t = cell(tau, rows)
-            fx = fraction(p, columns)
-            ft = fraction(tau, rows)
+            x = cell(p, maps.columns)
+            t = cell(tau, maps.rows)
+            fx = fraction(p, maps.columns)
+            ft = fraction(tau, maps.rows)
             two = int(2)
             for k in range(two):
-                tt = axis_index(t + k, rows, periodic)
+                row = n * maps.rows + axis_index(t + k, maps.rows, periodic)
                 ct = wp.where(k == 0, 1.0 - ft, ft)
                 for i in range(two):
-                    xx = axis_index(x + i, columns, 0)
                     c = ct * wp.where(i == 0, 1.0 - fx, fx)
-                    at = offset + ((n * rows + tt) * columns + xx) * 2
+                    at = offset + 2 * (row * maps.columns + axis_index(x + i, maps.columns, 0))
                     add(acc, lane, at, c * g[0])
                     add(acc, lane, at + 1, c * g[1])
 

@@ -14,7 +14,7 @@ import warp as wp
 from wlm_kernels import mlp
 from wlm_kernels.interpolate import axis_index, cell, fraction
 from wlm_kernels.lightmap.blocks import stored_texel
-from wlm_kernels.lightmap.features import CENTRE, INPUTS, MAP_INPUTS, power
+from wlm_kernels.lightmap.features import CENTRE, INPUTS, MAP_INPUTS, powers
 
 
 @wp.struct
@@ -92,7 +92,7 @@ def stored_volume_at(stored: Stored, n: int, u: float, v: float, tau: float) -> 
 def finish_radiance(time: TimeState, n: int, y: wp.vec3) -> wp.vec3:
     """Converts the output y of tile n's network to linear radiance, at least 0."""
     c = wp.max(wp.cw_mul(time.shift[n] + wp.cw_mul(time.spread[n], y), time.scale[n]), wp.vec3())
-    return power(c, time.gamma)
+    return powers(c, time.gamma)
 
 
 @functools.cache

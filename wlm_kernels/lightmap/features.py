@@ -14,8 +14,8 @@ Read first: `train_features` in `tests/reference/temporal.py`.
 import warp as wp
 
 from wlm_kernels.interpolate import axis_index, cell, fraction
-from wlm_kernels.lightmap.blocks import texel
-from wlm_kernels.native import native_source
+from wlm_kernels.lightmap.blocks import ste_mix
+from wlm_kernels.native import native_source, on_cuda
 
 INPUTS, MAP_INPUTS = 16, 12
 """Inputs of a network, and those of them that come from the maps; the encoded time follows."""
@@ -25,89 +25,170 @@ CENTRE = wp.constant(3.4641016151377544)  # sqrt(12)
 
 @wp.struct
 class Maps:
-    """The feature maps of N tiles (see the module), with S slices in F_uvt."""
+    """The feature maps of N tiles (see the module) in one array: where each map begins, and its shape."""
 
-    uv_endpoints: wp.array4d[wp.vec4]  # [N, 32, 32, 2]
-    uv_weights: wp.array3d[float]  # [N, 128, 128]
-    uvt_endpoints: wp.array4d[wp.vec4]  # [N * S, R/4, R/4, 2]
-    uvt_weights: wp.array3d[float]  # [N * S, R, R]
-    ut: wp.array3d[wp.vec2]  # [N, rows of time, columns]
-    vt: wp.array3d[wp.vec2]  # [N, rows of time, columns]
+    values: wp.array1d[float]  # in [0, 1]
+    uv_endpoints: int  # [N, 32, 32, 2, 4]
+    uv_weights: int  # [N, 128, 128]
+    uvt_endpoints: int  # [N, slices, side / 4, side / 4, 2, 4]
+    uvt_weights: int  # [N, slices, side, side]
+    ut: int  # [N, rows, columns, 2]
+    vt: int  # [N, rows, columns, 2]
+    slices: int
+    side: int
+    rows: int
+    columns: int
+
+
+@wp.func_native(native_source(__package__, "cells_at"))
+def cells_at(values: wp.array1d[float], i: int, j: int) -> wp.vec4: ...
+
+
+@wp.func_native(native_source(__package__, "four_at"))
+def four_at(values: wp.array1d[float], i: int) -> wp.vec4: ...
+
+
+@wp.func_native(native_source(__package__, "pair_at"))
+def pair_at(values: wp.array1d[float], i: int, j: int) -> wp.vec2: ...
 
 
 @wp.struct
-class Offsets:
-    """Index of the first gradient of each map in the flat array of all gradients."""
+class Place:
+    """Where numbers of a texel of F_uv are: index of its block's endpoints, 8 numbers, and of its weight."""
 
-    uv_endpoints: int
-    uv_weights: int
-    uvt_endpoints: int
-    uvt_weights: int
-    ut: int
-    vt: int
+    endpoints: int
+    weight: int
 
 
 @wp.func
-def ste_byte(v: float, quantised: int) -> float:
-    """Returns v clamped to [0, 1], or if quantised a multiple of 1/255. The adjoint treats the derivative as 1."""
-    c = wp.clamp(v, 0.0, 1.0)
-    if quantised == 0:
-        return c
-    return wp.floor(c * 255.0 + 0.5) / 255.0
+def uv_place(maps: Maps, n: int, flat: int) -> Place:
+    place = Place()
+    place.endpoints = maps.uv_endpoints + 8 * (1024 * n + 32 * (flat >> 9) + ((flat & 127) >> 2))
+    place.weight = maps.uv_weights + 16384 * n + flat
+    return place
 
 
-@wp.func_native(native_source(__package__, "plane_texel"))
-def plane_texel(values: wp.array3d[wp.vec2], n: int, t: int, x: int) -> wp.vec2: ...
+@wp.struct
+class Cell:
+    """The texels of F_uvt around a sample, two along each axis, and its place between them."""
 
-
-@wp.func
-def level_at(plane: wp.array3d[wp.vec2], n: int, t: int, x: int, quantised: int) -> wp.vec2:
-    v = plane_texel(plane, n, t, x)
-    return wp.vec2(ste_byte(v[0], quantised), ste_byte(v[1], quantised))
-
-
-@wp.func
-def plane_at(plane: wp.array3d[wp.vec2], n: int, p: float, tau: float, periodic: int, quantised: int) -> wp.vec2:
-    rows = plane.shape[1]
-    columns = plane.shape[2]
-    x = cell(p, columns)
-    t = cell(tau, rows)
-    fx = fraction(p, columns)
-    ft = fraction(tau, rows)
-    xa = axis_index(x, columns, 0)
-    xb = axis_index(x + 1, columns, 0)
-    ta = axis_index(t, rows, periodic)
-    tb = axis_index(t + 1, rows, periodic)
-    early = (1.0 - fx) * level_at(plane, n, ta, xa, quantised) + fx * level_at(plane, n, ta, xb, quantised)
-    late = (1.0 - fx) * level_at(plane, n, tb, xa, quantised) + fx * level_at(plane, n, tb, xb, quantised)
-    return (1.0 - ft) * early + ft * late
+    x: wp.vec2i
+    y: wp.vec2i
+    t: wp.vec2i
+    in_x: bool  # whether both along x lie in one block
+    in_y: bool
+    fx: float
+    fy: float
+    ft: float
 
 
 @wp.func
-def volume_at(
-    maps: Maps, n: int, slices: int, u: float, v: float, tau: float, periodic: int, quantised: int
-) -> wp.vec4:
-    height = maps.uvt_weights.shape[1]
-    width = maps.uvt_weights.shape[2]
-    x = cell(u, width)
-    y = cell(v, height)
-    t = cell(tau, slices)
-    fx = fraction(u, width)
-    fy = fraction(v, height)
-    ft = fraction(tau, slices)
+def cell_of(maps: Maps, u: float, v: float, tau: float, periodic: int) -> Cell:
+    x = cell(u, maps.side)
+    y = cell(v, maps.side)
+    t = cell(tau, maps.slices)
+    c = Cell()
+    c.x = wp.vec2i(axis_index(x, maps.side, 0), axis_index(x + 1, maps.side, 0))
+    c.y = wp.vec2i(axis_index(y, maps.side, 0), axis_index(y + 1, maps.side, 0))
+    c.t = wp.vec2i(axis_index(t, maps.slices, periodic), axis_index(t + 1, maps.slices, periodic))
+    c.in_x = c.x[0] >> 2 == c.x[1] >> 2
+    c.in_y = c.y[0] >> 2 == c.y[1] >> 2
+    c.fx = fraction(u, maps.side)
+    c.fy = fraction(v, maps.side)
+    c.ft = fraction(tau, maps.slices)
+    return c
+
+
+@wp.struct
+class Corners:
+    """The four texels of a slice of F_uvt around a sample, along x first: where their blocks' endpoints and their
+    weights are, and these."""
+
+    endpoints: wp.vec4i
+    weights: wp.vec4i
+    w: wp.vec4
+    low: wp.mat44
+    high: wp.mat44
+
+
+@wp.func
+def corners_at(maps: Maps, s: int, cell: Cell) -> Corners:
+    side = maps.side
+    endpoints = wp.vec4i()
+    weights = wp.vec4i()
+    for q in range(4):
+        y = s * side + cell.y[q // 2]
+        x = cell.x[q % 2]
+        endpoints[q] = maps.uvt_endpoints + 8 * ((y >> 2) * (side >> 2) + (x >> 2))
+        weights[q] = maps.uvt_weights + y * side + x
+    early = pair_at(maps.values, weights[0], weights[1])
+    late = pair_at(maps.values, weights[2], weights[3])
+    # Most samples have one block, which is read once: a GPU's cache looks up one line of a load after another.
+    low0 = four_at(maps.values, endpoints[0])
+    high0 = four_at(maps.values, endpoints[0] + 4)
+    low1 = low0
+    high1 = high0
+    if not cell.in_x:
+        low1 = four_at(maps.values, endpoints[1])
+        high1 = four_at(maps.values, endpoints[1] + 4)
+    low2 = low0
+    high2 = high0
+    low3 = low1
+    high3 = high1
+    if not cell.in_y:
+        low2 = four_at(maps.values, endpoints[2])
+        high2 = four_at(maps.values, endpoints[2] + 4)
+        low3 = low2
+        high3 = high2
+        if not cell.in_x:
+            low3 = four_at(maps.values, endpoints[3])
+            high3 = four_at(maps.values, endpoints[3] + 4)
+    c = Corners()
+    c.endpoints = endpoints
+    c.weights = weights
+    c.w = wp.vec4(early[0], early[1], late[0], late[1])
+    c.low = wp.matrix_from_rows(low0, low1, low2, low3)
+    c.high = wp.matrix_from_rows(high0, high1, high2, high3)
+    return c
+
+
+@wp.func
+def corner_weights(cell: Cell, k: int) -> wp.vec4:
+    """Returns the weights of the four texels around a sample in slice k of its two, along x first."""
+    ct = wp.where(k == 0, 1.0 - cell.ft, cell.ft)
+    early = ct * (1.0 - cell.fy)
+    late = ct * cell.fy
+    return wp.vec4(early * (1.0 - cell.fx), early * cell.fx, late * (1.0 - cell.fx), late * cell.fx)
+
+
+@wp.func
+def volume_at(maps: Maps, n: int, cell: Cell, quantised: int) -> wp.vec4:
     f = wp.vec4()
-    two = int(2)  # a variable keeps the loops rolled: unrolled, the code outgrows the GPU's instruction cache
+    two = int(2)  # a variable keeps the loop rolled: unrolled, the code outgrows the GPU's instruction cache
     for k in range(two):
-        s = n * slices + axis_index(t + k, slices, periodic)
-        ct = wp.where(k == 0, 1.0 - ft, ft)
-        for j in range(two):
-            yy = axis_index(y + j, height, 0)
-            cy = ct * wp.where(j == 0, 1.0 - fy, fy)
-            for i in range(two):
-                xx = axis_index(x + i, width, 0)
-                c = cy * wp.where(i == 0, 1.0 - fx, fx)
-                f += c * texel(maps.uvt_endpoints, maps.uvt_weights, s, yy, xx, quantised)
+        s = n * maps.slices + wp.where(k == 0, cell.t[0], cell.t[1])
+        corners = corners_at(maps, s, cell)
+        weights = corner_weights(cell, k)
+        for q in range(4):
+            f += weights[q] * ste_mix(corners.low[q], corners.high[q], corners.w[q], quantised)
     return f
+
+
+@wp.func
+def plane_at(maps: Maps, offset: int, n: int, p: float, tau: float, periodic: int) -> wp.vec2:
+    x = cell(p, maps.columns)
+    t = cell(tau, maps.rows)
+    fx = fraction(p, maps.columns)
+    ft = fraction(tau, maps.rows)
+    xa = offset + 2 * axis_index(x, maps.columns, 0)
+    xb = offset + 2 * axis_index(x + 1, maps.columns, 0)
+    ta = 2 * maps.columns * (n * maps.rows + axis_index(t, maps.rows, periodic))
+    tb = 2 * maps.columns * (n * maps.rows + axis_index(t + 1, maps.rows, periodic))
+    a = cells_at(maps.values, ta + xa, ta + xb)
+    b = cells_at(maps.values, tb + xa, tb + xb)
+    early = (1.0 - fx) * wp.vec2(a[0], a[1]) + fx * wp.vec2(a[2], a[3])
+    late = (1.0 - fx) * wp.vec2(b[0], b[1]) + fx * wp.vec2(b[2], b[3])
+    return (1.0 - ft) * early + ft * late
 
 
 @wp.struct
@@ -123,7 +204,6 @@ class Batch:
     number: wp.array1d[int]  # [N] number of the tile in its lightmap
     scale: wp.array2d[wp.vec3]  # [N, T] divisor of the colours at each time
     control: wp.array1d[int]  # [0] number of the step
-    slices: int  # S of F_uvt
     gamma: float
     inverse_range: wp.array2d[float]  # [N, T] 1 / the squared range of radiance; 0 where there is none
     tracked: wp.array4d[float]  # [lanes, N, T, 2] sum and count of squared errors of radiance; empty: not tracked
@@ -132,7 +212,7 @@ class Batch:
     spread: wp.array1d[wp.vec3]  # [N]
     emphasis: float  # exponent of the colour over scale in the weight of a texel; 0: none
     periodic: int
-    quantised: int  # as in `wlm_kernels.lightmap.blocks`
+    quantised: int  # whether the maps are on the levels of the file; until then features get noise
     frozen: int  # whether the maps get no gradients
     schedule: wp.array1d[wp.vec4]  # [steps] learning rates of maps and networks, and Adam's two corrections
     rates: wp.array1d[wp.vec4]  # [1] those of this step, written: the launch that uses them also counts the step
@@ -160,9 +240,23 @@ def draw_sample(batch: Batch, n: int, b: int, samples: int) -> Sample:
     return s
 
 
+@wp.func_native(
+    on_cuda(
+        """
+float y;
+asm("{.reg .f32 l; lg2.approx.f32 l, %1; mul.f32 l, l, %2; ex2.approx.f32 %0, l;}" : "=f"(y) : "f"(x), "f"(exponent));
+return y;
+""",
+        "return wp::pow(x, exponent);",
+    )
+)
+def _power(x: float, exponent: float) -> float: ...
+
+
 @wp.func
-def power(colour: wp.vec3, exponent: float) -> wp.vec3:
-    return wp.vec3(wp.pow(colour[0], exponent), wp.pow(colour[1], exponent), wp.pow(colour[2], exponent))
+def powers(c: wp.vec3, exponent: float) -> wp.vec3:
+    """Returns c ** exponent for c above 0, or 0 if the exponent is above 0; a GPU's relative error is about 1e-6."""
+    return wp.vec3(_power(c[0], exponent), _power(c[1], exponent), _power(c[2], exponent))
 
 
 @wp.func
@@ -172,13 +266,13 @@ def texel_weight(batch: Batch, n: int, k: int, target: wp.vec3) -> wp.vec3:
         return weight
     colour = batch.shift[n] + wp.cw_mul(batch.spread[n], target)
     least = 0.02  # keeps black texels in the fit
-    return wp.cw_mul(weight, power(wp.max(colour, wp.vec3(least)), batch.emphasis))
+    return wp.cw_mul(weight, powers(wp.max(colour, wp.vec3(least)), batch.emphasis))
 
 
 @wp.func
 def radiance_of(batch: Batch, n: int, k: int, y: wp.vec3) -> wp.vec3:
     c = wp.cw_mul(batch.shift[n] + wp.cw_mul(batch.spread[n], y), batch.scale[n, k])
-    return power(wp.max(c, wp.vec3()), batch.gamma)
+    return powers(wp.max(c, wp.vec3()), batch.gamma)
 
 
 @wp.func

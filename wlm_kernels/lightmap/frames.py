@@ -7,7 +7,7 @@ high half of a block's 16 little-endian bytes. `wlm.formats.bc7` defines and des
 
 import warp as wp
 
-from wlm_kernels.lightmap.features import power
+from wlm_kernels.lightmap.features import powers
 
 wp.set_module_options({"enable_backward": False})
 
@@ -157,9 +157,9 @@ def frame_colour(stored: StoredFrames, frame: int, y: int, x: int) -> wp.vec3:
 @wp.func
 def frame_radiance(stored: StoredFrames, early: int, late: int, share: float, n: int, y: int, x: int) -> wp.vec3:
     """Interpolates a texel's linear radiance between two frames; `share` is the weight of the later frame."""
-    light = power(frame_colour(stored, n * stored.times + early, y, x), stored.gamma)
+    light = powers(frame_colour(stored, n * stored.times + early, y, x), stored.gamma)
     if share > 0.0:
-        other = power(frame_colour(stored, n * stored.times + late, y, x), stored.gamma)
+        other = powers(frame_colour(stored, n * stored.times + late, y, x), stored.gamma)
         light = (1.0 - share) * light + share * other
     return light
 

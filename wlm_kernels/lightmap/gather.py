@@ -8,8 +8,8 @@ from typing import Any
 
 import warp as wp
 
-from wlm_kernels.lightmap.blocks import ste_endpoint, ste_weight
-from wlm_kernels.lightmap.features import INPUTS, Offsets
+from wlm_kernels.lightmap.blocks import over_255, ste_endpoint, ste_weight
+from wlm_kernels.lightmap.features import INPUTS, Maps, four_at
 from wlm_kernels.native import native_source, on_cuda
 
 wp.set_module_options({"enable_backward": False})
@@ -29,10 +29,6 @@ def _drain(sums: wp.array2d[float], i: int, clear: int) -> float:
         for p in range(sums.shape[0]):
             sums[p, i] = 0.0
     return s
-
-
-@wp.func_native(native_source(__package__, "four_at"))
-def _four_at(values: wp.array1d[float], i: int) -> wp.vec4: ...
 
 
 @wp.func_native(native_source(__package__, "put_four"))
@@ -83,6 +79,28 @@ def _move(values: wp.array1d[float], adam: Adam, i: int, grad: float, rate: floa
     adam.second[i] = new[2]
 
 
+@wp.func
+def _level(maps: Maps, at: int, v: wp.vec4) -> wp.vec4:
+    """Returns the levels of the file nearest to four numbers of maps, from index `at` on."""
+    if at < maps.uv_weights or (at >= maps.uvt_endpoints and at < maps.uvt_weights):
+        return ste_endpoint(v, 1)
+    if at < maps.ut:
+        return wp.vec4(ste_weight(v[0], 1), ste_weight(v[1], 1), ste_weight(v[2], 1), ste_weight(v[3], 1))
+    b = v * 255.0 + wp.vec4(0.5)
+    return over_255(wp.vec4(wp.floor(b[0]), wp.floor(b[1]), wp.floor(b[2]), wp.floor(b[3])))
+
+
+@wp.kernel
+def _put_levels(
+    # in:
+    maps: Maps,
+    # out:
+    rounded: wp.array1d[float],
+):
+    at = 4 * wp.tid()
+    _put_four(rounded, at, _level(maps, at, four_at(maps.values, at)))
+
+
 @wp.kernel
 def _update(
     # in:
@@ -91,11 +109,10 @@ def _update(
     clear: int,
     turned: int,
     rates: wp.array1d[wp.vec4],
-    offsets: Offsets,
     # in and out:
     acc: wp.array2d[Any],
     adam: Adam,
-    maps: wp.array1d[float],
+    maps: Maps,
     partial: wp.array2d[float],
     adam_hidden: Adam,
     hidden: wp.array1d[float],
@@ -130,27 +147,21 @@ def _update(
         return
     t -= mean_loss.shape[0]
     # All reads come before the first write, for which they would wait.
-    value = _four_at(maps, t)
-    first = _four_at(adam.first, t)
-    second = _four_at(adam.second, t)
+    at = 4 * t
+    value = four_at(maps.values, at)
+    first = four_at(adam.first, at)
+    second = four_at(adam.second, at)
     grad = _drain_four(acc, t)
     for c in range(4):
-        old = wp.vec3(wp.clamp(value[c], 0.0, 1.0), first[c], second[c])
-        new = _moved(old, grad[c], adam.decay, adam.epsilon, now[0], corrections)
-        value[c] = new[0]
+        new = _moved(wp.vec3(value[c], first[c], second[c]), grad[c], adam.decay, adam.epsilon, now[0], corrections)
+        value[c] = wp.clamp(new[0], 0.0, 1.0)
         first[c] = new[1]
         second[c] = new[2]
-    _put_four(maps, t, value)
-    _put_four(adam.first, t, first)
-    _put_four(adam.second, t, second)
-    at = 4 * t
-    if levels != 0 and at < offsets.ut:
-        if at < offsets.uv_weights or (at >= offsets.uvt_endpoints and at < offsets.uvt_weights):
-            _put_four(rounded, t, ste_endpoint(value, 1))
-        else:
-            for c in range(4):
-                value[c] = ste_weight(value[c], 1)
-            _put_four(rounded, t, value)
+    _put_four(maps.values, at, value)
+    _put_four(adam.first, at, first)
+    _put_four(adam.second, at, second)
+    if levels != 0:
+        _put_four(rounded, at, _level(maps, at, value))
 
 
 # Both forms are compiled with the module: the threads of a fit on the CPU would compile one at the same time.
@@ -171,15 +182,21 @@ def update(
 
     Args:
         arguments: Those of `_update` in its order. Sums are as `StepKernels.launch` adds them, those of maps are set to
-            0; `maps` are clamped to [0, 1], then updated; `rounded` gets their levels in the file.
+            0; `maps` are updated and clamped to [0, 1]; `rounded` gets their levels in the file.
         frozen, levels, clear: Whether only networks are updated, `rounded` is written, networks' sums are set to 0.
         turned: H if `turn` moves the weights of the hidden layers, of which only moments are updated here, else 0.
         lane, lanes: This launch updates one of so many parts of all parameters.
     """
-    maps, hidden, output, mean_loss = (arguments[i] for i in (4, 7, 10, 12))
-    total = hidden.shape[0] + output.shape[0] + mean_loss.shape[0] + (0 if frozen else maps.shape[0] // 4)
+    maps, hidden, output, mean_loss = (arguments[i] for i in (3, 6, 9, 11))
+    total = hidden.shape[0] + output.shape[0] + mean_loss.shape[0] + (0 if frozen else maps.values.shape[0] // 4)
     first, last = (min(total, each * -(-total // lanes)) for each in (lane, lane + 1))
-    wp.launch(_update, last - first, inputs=[int(levels), first, int(clear), turned, *arguments], device=maps.device)
+    wp.launch(_update, last - first, inputs=[int(levels), first, int(clear), turned, *arguments], device=hidden.device)
+
+
+def put_on_levels(maps: Maps, rounded: Maps) -> None:
+    """Writes the levels of the file that are nearest to `maps.values` to `rounded.values`."""
+    values = maps.values
+    wp.launch(_put_levels, values.shape[0] // 4, inputs=[maps], outputs=[rounded.values], device=values.device)
 
 
 @functools.cache

@@ -23,26 +23,6 @@ _SCALE = (np.sqrt(2.0 / np.pi) * 0.044715) ** (1.0 / 3.0)  # of arguments of GEL
 Maps = wp.types.vector(MAP_INPUTS, float)
 
 
-@wp.func_native(
-    on_cuda(
-        """
-float y;
-asm("{.reg .f32 l; lg2.approx.f32 l, %1; mul.f32 l, l, %2; ex2.approx.f32 %0, l;}" : "=f"(y) : "f"(x), "f"(exponent));
-return y;
-""",
-        "return wp::pow(x, exponent);",
-    )
-)
-def power(x: float, exponent: float) -> float:
-    """Returns x ** exponent for x >= 0 and an exponent above 0, on a GPU with a relative error of about 1e-6."""
-    ...
-
-
-@wp.func
-def powers(c: wp.vec3, exponent: float) -> wp.vec3:
-    return wp.vec3(power(c[0], exponent), power(c[1], exponent), power(c[2], exponent))
-
-
 def pack_networks(hidden: np.ndarray, output: np.ndarray) -> np.ndarray:
     """Arranges the weights of N networks as `native/matrix_network.cuh` reads them.
 

@@ -27,7 +27,8 @@ def matrix_network(hidden: int, gelu: str) -> Any:
     channels; `share`, a factor on every squared error; `row`, the number of this block of samples; and the results,
     written for each block: `partial` [rows * (18 + H), H], `partial_out` [rows * (H + 1), 3] and `loss` [rows].
 
-    It returns the gradient of the inputs of each sample, followed by the error of the output.
+    It returns the gradient of the inputs of each sample, followed by the error of the output, and the address of 80
+    bytes of shared memory that are now the sample's own: rows of a warp's lanes follow each other.
 
     Args:
         hidden: H, the number of hidden units, one of `WIDTHS`.
@@ -36,13 +37,13 @@ def matrix_network(hidden: int, gelu: str) -> Any:
     if hidden not in WIDTHS:
         raise ValueError(f"hidden: expected one of {WIDTHS} on CUDA, got {hidden}")
     vec_in, vec_hidden = wp.types.vector(INPUTS, float), wp.types.vector(hidden, float)
-    vec_result = wp.types.vector(INPUTS + 3, float)
+    vec_result = wp.types.vector(INPUTS + 4, float)
     # A row of 64 halves spans all banks: its groups of 8 are permuted to avoid bank conflicts; other rows are padded.
     rows = {"STRIDE": hidden, "MASK": 7} if hidden == WIDTHS[-1] else {"STRIDE": hidden + 8, "MASK": 0}
     constants = {"I": INPUTS, "H": hidden, "T": BLOCK, "EXACT": int(gelu == "exact"), **rows}
     code = native_source("wlm_kernels", "matrix_units") + native_source(__package__, "matrix_step", **constants)
 
-    @wp.func_native(on_cuda(code, f"return wp::vec_t<{INPUTS + 3}, float>();"))
+    @wp.func_native(on_cuda(code, f"return wp::vec_t<{INPUTS + 4}, float>();"))
     def network(
         hidden: wp.array2d[vec_hidden],
         output: wp.array2d[wp.vec3],

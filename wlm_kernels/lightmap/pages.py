@@ -18,8 +18,8 @@ from typing import Any
 import warp as wp
 
 from wlm_kernels.lightmap.decode import Stored, texel_network
+from wlm_kernels.lightmap.features import powers
 from wlm_kernels.lightmap.frames import StoredFrames, frame_colour
-from wlm_kernels.lightmap.matrix_network import powers
 from wlm_kernels.shared_exponent import pack_rgb9e5, unpack_rgb9e5
 
 COARSE_LEVEL, COARSE = 4, 8

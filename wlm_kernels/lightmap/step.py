@@ -20,19 +20,21 @@ import warp as wp
 
 from wlm_kernels import mlp
 from wlm_kernels.lightmap.adjoint import scatters
-from wlm_kernels.lightmap.blocks import texel
+from wlm_kernels.lightmap.blocks import ste_mix
 from wlm_kernels.lightmap.features import (
     CENTRE,
     INPUTS,
     MAP_INPUTS,
     Batch,
     Maps,
-    Offsets,
     Sample,
+    cell_of,
     draw_sample,
+    four_at,
     plane_at,
     texel_weight,
     track_error,
+    uv_place,
     volume_at,
 )
 from wlm_kernels.lightmap.matrix_step import BLOCK, matrix_network
@@ -63,7 +65,6 @@ class StepKernels:
     def launch(
         self,
         maps: Maps,
-        offsets: Offsets,
         hidden: wp.array,
         output: wp.array,
         batch: Batch,
@@ -78,13 +79,13 @@ class StepKernels:
         """Draws B samples of each of N tiles, and sums their losses and gradients.
 
         Args:
-            maps: The maps, whose M parameters are trained.
-            offsets: Positions of the gradients of each map in `acc`.
+            maps: The maps, whose M parameters are trained, or the levels of the file that are nearest to them.
             hidden: vecH [N, 18 + H], the hidden layers, see `wlm_kernels.mlp`.
             output: vec3 [N, H + 1], the output layers.
             batch: The training data.
             samples: B; on CUDA a multiple of `BLOCK`.
-            acc: [lanes, M], gradients of the maps, added to: int64 of one lane on CUDA, float of a lane per CPU thread.
+            acc: [lanes, M], gradients of `maps.values`, added to: int64 of one lane on CUDA, float of a lane for each
+                thread of the CPU.
             partial: float [P, N, 18 + H, H], gradients of the hidden layers: on CUDA of P blocks of `BLOCK` samples,
                 written; on the CPU of P lanes, added to.
             partial_out: float [P, N, H + 1, 3], gradients of the output layers, like `partial`.
@@ -95,8 +96,8 @@ class StepKernels:
         span = samples if count is None else count
         wp.launch(
             self._step,
-            (tiles, span),
-            inputs=[maps, offsets, hidden, output, batch, samples, base],
+            tiles * span if self.scalar == wp.int64 else (tiles, span),
+            inputs=[maps, hidden, output, batch, samples, base],
             outputs=[acc, partial, partial_out, loss],
             device=hidden.device,
             block_dim=BLOCK,
@@ -121,54 +122,56 @@ def step_kernels(hidden: int, gelu: str, device_kind: str) -> StepKernels:
     units, columns_2 = net.hidden, INPUTS + 1
 
     @wp.func
-    def features(maps: Maps, batch: Batch, n: int, y: int, x: int, k: int, state: wp.uint32) -> vec_in:
+    def place_of(sample: Sample):
+        return (float(sample.flat & 127) + 0.5) / 128.0, (float(sample.flat >> 7) + 0.5) / 128.0
+
+    @wp.func
+    def sampled(maps: Maps, batch: Batch, n: int, sample: Sample, quantised: int) -> vec_in:
         f = vec_in()
-        uv = texel(maps.uv_endpoints, maps.uv_weights, n, y, x, batch.quantised)
+        u, v = place_of(sample)
+        tau = batch.tau[sample.k]
+        place = uv_place(maps, n, sample.flat)
+        low = four_at(maps.values, place.endpoints)
+        high = four_at(maps.values, place.endpoints + 4)
+        w = maps.values[place.weight]
+        uvt = volume_at(maps, n, cell_of(maps, u, v, tau, batch.periodic), quantised)
+        uv = ste_mix(low, high, w, quantised)  # late, so that its reads need no waiting
+        ut = plane_at(maps, maps.ut, n, u, tau, batch.periodic)
+        vt = plane_at(maps, maps.vt, n, v, tau, batch.periodic)
+        e = batch.encoding[sample.k]
         for c in range(4):
             f[c] = uv[c]
-        u = (float(x) + 0.5) / 128.0
-        v = (float(y) + 0.5) / 128.0
-        tau = batch.tau[k]
-        uvt = volume_at(maps, n, batch.slices, u, v, tau, batch.periodic, batch.quantised)
-        ut = plane_at(maps.ut, n, u, tau, batch.periodic, batch.quantised)
-        vt = plane_at(maps.vt, n, v, tau, batch.periodic, batch.quantised)
-        e = batch.encoding[k]
-        for c in range(4):
             f[4 + c] = uvt[c]
             f[12 + c] = e[c]
         for c in range(2):
             f[8 + c] = ut[c]
             f[10 + c] = vt[c]
-        for c in range(wp.static(MAP_INPUTS)):
-            # Eq. 6: noise in place of the rounding, until the maps are quantised.
-            noise = wp.where(batch.quantised == 0, (wp.randf(state) - 0.5) * NOISE, 0.0)
-            f[c] = (f[c] + noise - 0.5) * CENTRE
         return f
 
     @wp.func
-    def scatter(
-        acc: wp.array2d[scalar],
-        lane: int,
-        offsets: Offsets,
-        maps: Maps,
-        batch: Batch,
-        n: int,
-        sample: Sample,
-        g: vec_in,
-    ):
+    def features(maps: Maps, batch: Batch, n: int, sample: Sample) -> vec_in:
+        f = vec_in()
+        state = sample.state
+        if batch.quantised == 0:
+            f = sampled(maps, batch, n, sample, 0)
+            for c in range(wp.static(MAP_INPUTS)):
+                f[c] += (wp.randf(state) - 0.5) * NOISE  # eq. 6: in place of the rounding, until maps are quantised
+        else:
+            f = sampled(maps, batch, n, sample, 1)
+        for c in range(wp.static(MAP_INPUTS)):
+            f[c] = (f[c] - 0.5) * CENTRE
+        return f
+
+    @wp.func
+    def scatter(acc: wp.array2d[scalar], lane: int, maps: Maps, batch: Batch, n: int, sample: Sample, g: vec_in):
         c = CENTRE
-        y = sample.flat // 128
-        x = sample.flat % 128
-        scatter_texel(acc, lane, offsets, maps, n, y, x, batch.quantised, c * wp.vec4(g[0], g[1], g[2], g[3]))
-        u = (float(x) + 0.5) / 128.0
-        v = (float(y) + 0.5) / 128.0
+        u, v = place_of(sample)
         tau = batch.tau[sample.k]
-        volume = c * wp.vec4(g[4], g[5], g[6], g[7])
-        scatter_volume(acc, lane, offsets, maps, n, batch.slices, u, v, tau, batch.periodic, batch.quantised, volume)
-        rows = maps.ut.shape[1]
-        columns = maps.ut.shape[2]
-        scatter_plane(acc, lane, offsets.ut, rows, columns, n, u, tau, batch.periodic, c * wp.vec2(g[8], g[9]))
-        scatter_plane(acc, lane, offsets.vt, rows, columns, n, v, tau, batch.periodic, c * wp.vec2(g[10], g[11]))
+        cell = cell_of(maps, u, v, tau, batch.periodic)
+        scatter_texel(acc, lane, maps, n, sample.flat, c * wp.vec4(g[0], g[1], g[2], g[3]))
+        scatter_volume(acc, lane, maps, n, cell, c * wp.vec4(g[4], g[5], g[6], g[7]))
+        scatter_plane(acc, lane, maps, maps.ut, n, u, tau, batch.periodic, c * wp.vec2(g[8], g[9]))
+        scatter_plane(acc, lane, maps, maps.vt, n, v, tau, batch.periodic, c * wp.vec2(g[10], g[11]))
 
     # The depth is LLVM's own, at which it finds the vectors of the network; Warp's default of 4 does not.
     flags = "-march=native -mllvm=-inline-threshold=9000 -mllvm=-slp-recursion-max-depth=12"
@@ -186,10 +189,8 @@ def step_kernels(hidden: int, gelu: str, device_kind: str) -> StepKernels:
     ):
         n, b = wp.tid()
         sample = draw_sample(batch, n, b, samples)
-        y = sample.flat // 128
-        x = sample.flat % 128
-        place[n, b] = wp.vec3i(y, x, sample.k)
-        f[n, b] = features(maps, batch, n, y, x, sample.k, sample.state)
+        place[n, b] = wp.vec3i(sample.flat // 128, sample.flat % 128, sample.k)
+        f[n, b] = features(maps, batch, n, sample)
 
     if device_kind == "cpu":
 
@@ -197,7 +198,6 @@ def step_kernels(hidden: int, gelu: str, device_kind: str) -> StepKernels:
         def step(
             # in:
             maps: Maps,
-            offsets: Offsets,
             hidden: wp.array2d[vec_hidden],
             output: wp.array2d[wp.vec3],
             batch: Batch,
@@ -214,7 +214,7 @@ def step_kernels(hidden: int, gelu: str, device_kind: str) -> StepKernels:
             lane = wp.where(base == 0, 0, 1)
             sample = draw_sample(batch, n, b, samples)
             k = sample.k
-            f = features(maps, batch, n, sample.flat // 128, sample.flat % 128, k, sample.state)
+            f = features(maps, batch, n, sample)
             a1 = first(hidden, n, f)
             g1 = gate(a1)
             h1 = wp.cw_mul(a1, g1)
@@ -238,7 +238,7 @@ def step_kernels(hidden: int, gelu: str, device_kind: str) -> StepKernels:
             partial[lane, n, wp.static(columns_2 + units)] += d2
             partial_out[lane, n, wp.static(units)] += d3
             if batch.frozen == 0:
-                scatter(acc, lane, offsets, maps, batch, n, sample, back_input(hidden, n, d1))
+                scatter(acc, lane, maps, batch, n, sample, back_input(hidden, n, d1))
 
     else:
         network = matrix_network(hidden, gelu)
@@ -247,7 +247,6 @@ def step_kernels(hidden: int, gelu: str, device_kind: str) -> StepKernels:
         def step(
             # in:
             maps: Maps,
-            offsets: Offsets,
             hidden: wp.array2d[vec_hidden],
             output: wp.array2d[wp.vec3],
             batch: Batch,
@@ -259,11 +258,13 @@ def step_kernels(hidden: int, gelu: str, device_kind: str) -> StepKernels:
             partial_out: wp.array2d[float],
             loss: wp.array1d[float],
         ):
-            n, b = wp.tid()
+            i = wp.tid()
+            n = i // samples
+            b = i - n * samples
             sample = draw_sample(batch, n, b, samples)
             k = sample.k
-            f = features(maps, batch, n, sample.flat // 128, sample.flat % 128, k, sample.state)
-            target = batch.targets[n, k, sample.flat]
+            target = batch.targets[n, k, sample.flat]  # first, since it is far away
+            f = features(maps, batch, n, sample)
             weight = texel_weight(batch, n, k, target)
             row = (b // wp.static(BLOCK)) * hidden.shape[0] + n
             share = 1.0 / (3.0 * float(samples))
@@ -274,6 +275,6 @@ def step_kernels(hidden: int, gelu: str, device_kind: str) -> StepKernels:
             for c in range(wp.static(INPUTS)):
                 g[c] = r[c]
             if batch.frozen == 0:
-                scatter(acc, 0, offsets, maps, batch, n, sample, g)
+                scatter(acc, int(r[wp.static(INPUTS + 3)]), maps, batch, n, sample, g)
 
     return StepKernels(net, scalar, draw, step)

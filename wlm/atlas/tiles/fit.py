@@ -45,7 +45,7 @@ from wlm_kernels.atlas import solve as kernels
 SUPERSAMPLING = 2
 """Points per texel and axis at which a tile is fitted."""
 
-_AT_ONCE, _AT_ONCE_CUDA = 8192, 1 << 18  # tiles
+_AT_ONCE, _AT_ONCE_CUDA = 8192, 65536  # tiles; other numbers change the last bits of products on a GPU
 _SHARES = tuple((k + 0.5) / SUPERSAMPLING for k in range(SUPERSAMPLING))  # weight of the second texel at a point
 # Conjugate gradient rounds from the unweighted solution: for curves, for curves of blocks, and for stored samples.
 _ROUGH, _MEDIUM, _FINE = 3, 10, 24

@@ -1,5 +1,5 @@
 // A GPU reads four neighbours at once.
-    const float* from = &wp::index(values, 4 * i);
+    const float* from = values.data + i;
 #if defined(__CUDA_ARCH__)
     const float4 v = *reinterpret_cast<const float4*>(from);
     return wp::vec_t<4, float>(v.x, v.y, v.z, v.w);

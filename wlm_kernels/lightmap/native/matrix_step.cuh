@@ -24,14 +24,27 @@ struct Place {
     static __device__ int input(int row, int group) { return row * 16 + ((group ^ (row >> 2 & 1)) << 3); }
 };
 struct Gelu {
-    static __device__ float gate(float x) {
-        if (EXACT) return 0.5f + 0.5f * erff(x * 0.7071067811865476f);
-        return __fdividef(1.0f, 1.0f + __expf(x * (-1.5957691216057308f - 0.07135481627260025f * x * x)));
+    // GELU of two numbers, x and y, and its slopes there.
+    static __device__ void evaluate(float x, float y, unsigned& h, unsigned& slopes) {
+        if (EXACT) {
+            const float on_x = gate(x), on_y = gate(y);
+            h = Units::pack(x * on_x, y * on_y);
+            slopes = Units::pack(slope(x, on_x), slope(y, on_y));
+        } else {
+            // The gate is (1 + tanh z) / 2 with z = 0.7979 x + 0.03568 x^3, its slope is 2 gate (1 - gate) dz/dx. Beyond
+            // +-8 it is 0 or 1.
+            const unsigned half = 0x38003800u, pair = Units::pack(x, y);
+            unsigned near;
+            asm("{min.f16x2 %0, %1, %2; max.f16x2 %0, %0, %3;}" : "=&r"(near) : "r"(pair), "r"(0x48004800u), "r"(0xc800c800u));
+            const unsigned square = Units::scale(near, near);
+            const unsigned z = Units::scale(near, Units::fma(square, 0x28912891u, 0x3a623a62u));
+            const unsigned on = Units::fma(Units::tanh(z), half, half), rest = Units::fma(on ^ 0x80008000u, on, on);
+            h = Units::scale(pair, on);
+            slopes = Units::fma(rest, Units::scale(near, Units::fma(square, 0x32da32dau, 0x3e623e62u)), on);
+        }
     }
-    static __device__ float slope(float x, float gate) {
-        if (EXACT) return gate + x * 0.3989422804014327f * __expf(-0.5f * x * x);
-        return gate + 2.0f * x * gate * (1.0f - gate) * (0.7978845608028654f + 0.10703222440890037f * x * x);
-    }
+    static __device__ float gate(float x) { return 0.5f + 0.5f * erff(x * 0.7071067811865476f); }
+    static __device__ float slope(float x, float gate) { return gate + x * 0.3989422804014327f * __expf(-0.5f * x * x); }
 };
 __shared__ __align__(16) unsigned short inputs[T * 16], w2[H * STRIDE], both[2 * T * STRIDE];
 // Of a sample: its answer; then as halves its d3 in its own units, 0, its d3 in the block's units and their ratio.
@@ -52,8 +65,10 @@ const float* o = reinterpret_cast<const float*>(output.data) + size_t(n) * (H + 
 
 // Weights, and the sample's inputs.
 const auto load_weights = [&](unsigned short* to, const float* from, int rows, int filled) {
-    for (int i = t; i < rows * H / 4; i += T) {
-        const int r = i / (H / 4), column = i % (H / 4) * 4;
+    #pragma unroll
+    for (int j = 0; j < (rows * H / 4 + T - 1) / T; ++j) {
+        const int i = t + j * T, r = i / (H / 4), column = i % (H / 4) * 4;
+        if (i >= rows * H / 4) break;
         float4 v = make_float4(0.0f, 0.0f, 0.0f, 0.0f);
         if (r < filled) v = *reinterpret_cast<const float4*>(from + r * H + column);
         *reinterpret_cast<uint2*>(to + Place::at(r, column >> 3) + (column & 4)) =
@@ -111,11 +126,8 @@ for (int layer = 0; layer < 2; ++layer) {
             for (int j = 0; j < 2; ++j)
                 #pragma unroll
                 for (int r = 0; r < 2; ++r) {
-                    const float x = s[m][j][2 * r], y = s[m][j][2 * r + 1];
-                    const float on_x = Gelu::gate(x), on_y = Gelu::gate(y);
-                    slopes[layer][m][2 * p + j][r] = Units::pack(Gelu::slope(x, on_x), Gelu::slope(y, on_y));
                     unsigned* h = reinterpret_cast<unsigned*>(to + Place::at(first + 16 * m + 8 * r + g, 2 * p + j));
-                    h[q] = Units::pack(x * on_x, y * on_y);
+                    Gelu::evaluate(s[m][j][2 * r], s[m][j][2 * r + 1], h[q], slopes[layer][m][2 * p + j][r]);
                 }
     }
     __syncthreads();
@@ -367,9 +379,10 @@ for (int m = 0; m < 2; ++m)
             *reinterpret_cast<float2*>(passed + (first + 16 * m + 8 * r + g) * WIDE + 8 * j + 2 * q) =
                 make_float2(on_inputs[m][j][2 * r], on_inputs[m][j][2 * r + 1]);
 __syncwarp();
-wp::vec_t<I + 3, float> result;
+wp::vec_t<I + 4, float> result;
 #pragma unroll
 for (int c = 0; c < I; ++c) result.c[c] = passed[t * WIDE + c] * back;
 #pragma unroll
 for (int c = 0; c < 3; ++c) result.c[I + c] = error[c];
+result.c[I + 3] = static_cast<float>(__cvta_generic_to_shared(passed + t * WIDE));
 return result;
