@@ -305,6 +305,18 @@ class LostLight:
             if 2 * off > int(lit.count_nonzero()):
                 self.hidden += off
 
+    @staticmethod
+    def groups_to_add(reference: np.ndarray, decoded: np.ndarray) -> np.ndarray:
+        """Returns in which of N groups `add` may count points, bool [N]; both are [N, K, 3], at least 0, and 0 where a
+        group has no point."""
+        error = np.abs(decoded - reference)
+        light, kept, off = (
+            np.maximum(np.maximum(x[..., 0], x[..., 1]), x[..., 2]) for x in (reference, decoded, error)
+        )
+        lost = (light >= _BRIGHT * light.max(1, keepdims=True)) & (kept < _KEPT * light)
+        lit = light > 0
+        return lost.any(1) | (2 * ((off > _KEPT * light) & lit).sum(1) > lit.sum(1))
+
     def merge(self, other: "LostLight") -> None:
         """Adds the groups of another search, as if they had been added here in their order."""
         self.count += other.count

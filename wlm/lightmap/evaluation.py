@@ -251,12 +251,16 @@ def _lost_light(model: SheetModel, lightmaps: SheetFrames, device: str) -> list[
         doubtful = [at for at in _windows(model) if _may_hide_loss(frame[at[1]], inside[at[1]])]
         for start in range(0, len(doubtful), _TILES_AT_ONCE):
             some = doubtful[start : start + _TILES_AT_ONCE]
-            for (tile, window), decoded in zip(some, decoder.tiles([tile for tile, _ in some], stamp), strict=True):
-                part = frame[window]
-                both = part, decoded[: part.shape[0], : part.shape[1]]
-                # A mask as the index would take six times as long.
-                valid = np.flatnonzero(inside[window])
-                own.add(*(texels.reshape(-1, 3).take(valid, 0) for texels in both), _place(tile, stamp))
+            decoded = decoder.tiles([tile for tile, _ in some], stamp)
+            reference, valid = np.zeros_like(decoded), np.zeros(decoded.shape[:3], bool)
+            for k, (_, window) in enumerate(some):
+                height, width = inside[window].shape
+                reference[k, :height, :width], valid[k, :height, :width] = frame[window], inside[window]
+            flat = [(light * valid[..., None]).reshape(len(some), -1, 3) for light in (reference, decoded)]
+            # Many groups at once: single ones take longer, and threads would wait for Python's lock.
+            for k in np.flatnonzero(LostLight.groups_to_add(*flat)):
+                texels = np.flatnonzero(valid[k])
+                own.add(*(light[k].take(texels, 0) for light in flat), _place(some[k][0], stamp))
         return own
 
     # Loads the kernel of each kind of tile: threads must not do it at once.
