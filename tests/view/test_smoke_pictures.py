@@ -17,6 +17,7 @@ from wlm.smoke.scene import CameraSettings, LightSettings, ObstacleSettings, mak
 from wlm.smoke.shading import Light, PointLight, Ramp
 from wlm.smoke.transport.lighting import light_smoke
 from wlm.smoke.transport.orders import scatter
+from wlm.view.display import white_of
 from wlm.view.pictures import contact_sheet, encode, to_bytes
 from wlm.view.smoke import Drawing, picture
 from wlm_kernels.smoke.settings import March
@@ -236,3 +237,8 @@ def test_exposure():
     # sRGB of a half is 188, of a thousandth 12.92 / 1000.
     np.testing.assert_array_equal(encoded, [[[0, 188, 255], [255, 0, 3]]])
     assert (encode(light, np.zeros((1, 2), bool), 1.0) == 128).all()
+    assert white_of(np.zeros((5, 3))) == 1.0 == white_of(np.zeros((0, 3)))
+    dark = np.zeros((10000, 3))
+    dark[0] = 3.0
+    assert white_of(dark) == 3.0, "one lamp in the dark"
+    assert white_of(np.arange(1001.0)) == pytest.approx(995.0)

@@ -12,6 +12,7 @@ from wlm.texels import filmic, to_srgb
 TONES = ("clamped", "filmic")
 """How light above white is shown: it is clipped, or an extended Reinhard curve maps 4 to white."""
 
+_WHITE_PERCENTILE = 99.5
 _HEAT = np.array([[0.0, 0.0, 0.0], [0.45, 0.1, 0.5], [1.0, 0.6, 0.1], [1.0, 1.0, 1.0]])
 _HEAT_AT = (0.0, 0.33, 0.66, 1.0)
 
@@ -53,6 +54,12 @@ def heat(values: np.ndarray) -> np.ndarray:
     place = np.floor(place) + share * share * (3.0 - 2.0 * share)
     colours = np.stack([np.interp(place, range(len(_HEAT)), channel) for channel in _HEAT.T], 1)
     return _bytes(colours)[np.round(values * 255.0).astype(np.uint8)]
+
+
+def white_of(light: np.ndarray) -> float:
+    """Chooses the radiance that is shown as white: the 99.5th percentile; 1 if there is no light."""
+    white = float(np.percentile(light, _WHITE_PERCENTILE)) if light.size else 0.0
+    return white if white > 0 else float(light.max(initial=0.0)) or 1.0
 
 
 def _bytes(values: np.ndarray) -> np.ndarray:
