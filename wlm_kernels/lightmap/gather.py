@@ -199,6 +199,11 @@ def put_on_levels(maps: Maps, rounded: Maps) -> None:
     wp.launch(_put_levels, values.shape[0] // 4, inputs=[maps], outputs=[rounded.values], device=values.device)
 
 
+def _turn_threads(width: int, is_cuda: bool) -> int:
+    """Returns the number of threads that move a layer together: on a GPU a warp for each 16 x 16 weights."""
+    return width * width // 8 if is_cuda else 1
+
+
 @functools.cache
 def _turn_kernel(width: int, threads: int) -> Any:
     cuda = native_source(__package__, "orthogonal", H=width, T=threads)
@@ -223,13 +228,13 @@ def load(device: str, turned: int) -> None:
     """Compiles `update` for a device, and `turn` of a width, unless it is 0; the first launch would do so otherwise."""
     wp.load_module(_update.module, device)
     if turned:
-        threads = 1 if device == "cpu" else turned * turned // 8
+        threads = _turn_threads(turned, device != "cpu")
         wp.load_module(_turn_kernel(turned, threads).module, device, block_dim=threads)
 
 
 def turn(width: int, rates: wp.array, momentum: wp.array, weights: wp.array) -> None:
     """Moves the weights of networks' hidden layers of a width H, float [N (18 + H) H] as in `wlm_kernels.mlp`, with
     Muon: along their momentum made orthogonal (Jordan et al., 2024), at the rate `rates[0][1]`. Biases stay."""
-    threads = width * width // 8 if weights.device.is_cuda else 1
+    threads = _turn_threads(width, weights.device.is_cuda)
     shape, kernel = (weights.shape[0] // ((INPUTS + 2 + width) * width), 2, threads), _turn_kernel(width, threads)
     wp.launch(kernel, shape, inputs=[rates, momentum, weights], device=weights.device, block_dim=threads)

@@ -8,22 +8,11 @@ import warp as wp
 LEVELS = 127
 
 _MOST = wp.constant(float(LEVELS))
-_ROWS = wp.constant(16)  # weights that a thread reads before it compares them, so that a GPU reads them together
-_Weights = wp.types.vector(16, float)
 
 
 @wp.func
 def _half(value: float) -> float:
     return float(wp.float16(value))
-
-
-@wp.func
-def _weights(values: wp.array3d[float], n: int, row: int, end: int, j: int) -> _Weights:
-    """Reads the weights of rows `row` to `row` + 15 of column j; a row from `end` on counts as the one before `end`."""
-    weights = _Weights()
-    for i in range(_ROWS):
-        weights[i] = values[n, wp.min(row + i, end - 1), j]
-    return weights
 
 
 @wp.func
@@ -34,8 +23,8 @@ def _column_on_levels(
     follows them."""
     end = first + rows
     most = float(0.0)
-    for row in range(first, end, _ROWS):
-        most = wp.max(most, wp.max(wp.abs(_weights(values, n, row, end, j))))
+    for row in range(first, end):
+        most = wp.max(most, wp.abs(values[n, row, j]))
     level = _half(most) / _MOST
     divisor = wp.where(level > 0.0, level, 1.0)
     for row in range(first + part, end, parts):
