@@ -258,6 +258,14 @@ def test_the_absolute_error_counts_bright_probes(clustered):
     assert 0.03 < found(model.decoder().decode_probes() - lit(values) + values) < 0.0501
 
 
+def test_one_dark_probe_does_not_multiply_the_bytes():
+    """Its magnitude, without bits, is off by a factor of a million, which no prediction of errors covers."""
+    values = (1.0 + 0.1 * NORMAL.normal(size=(2000, 27))).astype(np.float32)
+    values[0] *= 1e-6
+    sizes = [fit_components(values, enough=enough)[0].nbytes for enough in (0.2, 0.5)]
+    assert sizes[1] <= sizes[0]
+
+
 @pytest.mark.parametrize("live", (9, 40, 300))
 def test_more_bytes_have_less_error(live, clustered):
     values = clustered[:live]
@@ -284,7 +292,7 @@ def test_hard_sets_of_components(kind, tmp_path):
     back = wlm.load(tmp_path / "a.wlm")
     decoded = back.decoder().decode_probes()
     np.testing.assert_array_equal(decoded, model.decoder().decode_probes())
-    assert np.isfinite(decoded).all() and (relative_error(back, probes) < 0.03).all()
+    assert np.isfinite(decoded).all() and (relative_error(back, probes) < 0.04).all()
     assert np.isfinite(back.decoder().decode(position.mean(0, keepdims=True))).all()
 
 

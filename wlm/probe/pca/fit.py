@@ -136,7 +136,9 @@ def fit_components(
         components, error = _coded(values, light, hours, best)
         if error <= enough or best.error > target.error or not best.error:
             return components, error
-        target = target._replace(error=min(0.9 * target.error * enough / error, 0.99 * best.error))
+        # The error of magnitudes without bits is exponential.
+        wanted = max(0.9 * target.error * enough / error, 0.5 * best.error)
+        target = target._replace(error=min(wanted, 0.99 * best.error))
         best = _planned(best.table, target)
 
 
