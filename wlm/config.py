@@ -153,6 +153,7 @@ def _yaml_problem(error: Exception) -> str:
 def _first_problem(cls: type[BaseModel], error: ValidationError, as_option: bool) -> str:
     problems = error.errors(include_url=False)
     problem = problems[0]
+    message = problem["msg"].removeprefix("Value error, ")
     field = ".".join(str(part) for part in problem["loc"]) or "settings"
     if as_option:
         field = field.replace(".", "-").replace("_", "-")
@@ -167,10 +168,10 @@ def _first_problem(cls: type[BaseModel], error: ValidationError, as_option: bool
         text = f"{field}: expected a mapping, got {_shown(problem['input'])}"
     elif isinstance(problem["input"], dict) and "Input" not in problem["msg"]:
         # A check of several fields together: its message, or else its type, names one of them.
-        name = [] if ": " in problem["msg"] else [problem["type"]]
-        text = ": ".join(filter(None, [".".join([*map(str, problem["loc"]), *name]), problem["msg"]]))
+        name = [] if ": " in message or problem["type"] == "value_error" else [problem["type"]]
+        text = ": ".join(filter(None, [".".join([*map(str, problem["loc"]), *name]), message]))
     else:
-        expected = problem["msg"].replace("Input should be", "expected", 1).removeprefix("Value error, ")
+        expected = message.replace("Input should be", "expected", 1)
         text = f"{field}: {expected}, got {_shown(problem['input'])}"
     return text if len(problems) == 1 else f"{text} (and {len(problems) - 1} more)"
 
