@@ -235,7 +235,8 @@ def simulate(
 
     Raises:
         WlmError: As `make_solver`; an obstacle is too fast; the air blew up; a file is damaged or cannot be written; a
-            frame before the saved state, or its copy in the format of `volumes`, is missing; or another process is writing the folder.
+            frame before the saved state, or its copy in the format of `volumes`, is missing; or another process is
+            writing the folder.
     """
     with locked(frames.path):
         scene, checkpoint = frames.scene, frames.path / CHECKPOINT
