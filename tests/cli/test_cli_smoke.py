@@ -70,6 +70,10 @@ def test_frames_that_were_made_are_not_made_again(words, method, other, frames, 
     turned = (["--camera", "turn=5"], "cannot resume a run with another camera")
     for change, says in ((other, "six.partial: cannot resume a run with another"), turned):
         assert says in fails(*words, *change, "-o", out, "--resume")
+    stat = (frames / "frame_0003.npz").stat()
+    os.utime(frames / "frame_0003.npz", ns=(0, 0))
+    assert "cannot resume a run with another input" in fails(*words, "-o", out, "--resume")
+    os.utime(frames / "frame_0003.npz", ns=(stat.st_atime_ns, stat.st_mtime_ns))
     call(*words, "-o", out, "--resume")
     assert len(made) == 4 and "2 frames are finished" in call.stderr
     assert [(out / name).stat().st_mtime_ns for name in names[:2]] == before

@@ -54,7 +54,16 @@ def test_frames_keep_their_obstacles_and_lights(tmp_path):
     assert not np.array_equal(*(png(tmp_path / "lit" / f"light_000{n}.png") for n in (1, 2)))
 
 
-@pytest.mark.parametrize("words, message", [(("--light", "0,0,0"), "--light"), (("--point", "0,0,0:-1"), "--point")])
+@pytest.mark.parametrize(
+    "words, message",
+    [
+        (("--light", "0,0,0"), "--light"),
+        (("--light", "0,0,1:1e13"), "--light: irradiance.0: expected less than or equal to"),
+        (("--point", "0,0,0:-1"), "--point"),
+        (("--camera", "turn=inf"), "--camera turn: expected a finite number, got 'inf'"),
+        (("--camera", "distance=1e-18"), "the distance to the target is too short: 1e-18"),
+    ],
+)
 def test_wrong_options_are_one_line(volume, tmp_path, words, message):
     output = tmp_path / "out.png"
     assert message in fails("smoke", "light", volume, "-o", output, *SMALL, *words)

@@ -118,6 +118,8 @@ def test_a_simulation_is_stopped_and_resumed(within, jet, tmp_path, monkeypatch)
     # With another scene it isn't resumed, and nothing is lost by the attempt.
     (tmp_path / "other.yaml").write_text(yaml.safe_dump(JET | {"air": {"viscosity": 1.0}}))
     assert "its frames have another air" in fails("smoke", "simulate", tmp_path / "other.yaml", "-o", out, "--resume")
+    volumes = ("smoke", "simulate", scene, "-o", out, "--resume", "--volumes", "nvdb-raw")
+    assert "frame_0001.nvdb of a finished frame is missing" in fails(*volumes)
     monkeypatch.setattr(Solver, "step", lambda self, steps=1: done.append(1) or step(self, steps))
     call("smoke", "simulate", scene, "-o", out, "--resume", "--checkpoint-every", 0)
     assert len(done) == 4 * per_frame, "no step is done twice"
@@ -130,6 +132,7 @@ def test_a_simulation_is_stopped_and_resumed(within, jet, tmp_path, monkeypatch)
     call("smoke", "simulate", scene, "-o", out, "--resume")
     assert "nothing to resume" not in call.stderr
     assert (out / "frame_0004.npz").stat().st_mtime_ns == before
+    assert "frame_0001.nvdb of a finished frame is missing" in fails(*volumes)
 
 
 def test_a_simulation_goes_on_with_corrected_settings(tmp_path, monkeypatch):

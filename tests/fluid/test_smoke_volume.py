@@ -40,6 +40,9 @@ def test_npz(tmp_path: Path, device: str):
     assert volume.warnings == () and volume.device.type == device[:4].rstrip(":")
     scaled = load_volume(path, voxel=1.0)
     assert scaled.voxel == 1.0 and scaled.origin == (4.0, 8.0, 12.0)
+    chosen = load_volume(path, density="temperature")
+    assert chosen.temperature is None and float(chosen.density.max()) == pytest.approx(23 / 24)
+    assert torch.equal(load_volume(path, temperature="density").temperature, load_volume(path).density)
 
 
 def test_bricks(tmp_path: Path, device: str):

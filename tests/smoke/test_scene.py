@@ -331,6 +331,8 @@ def test_lights_and_glow():
     np.testing.assert_allclose(seen.toward, away / np.linalg.norm(away))
     (near,) = Scene.model_validate(SCENE | {"lights": [place | {"position": centre.tolist()}]}).looks(1).lights
     np.testing.assert_allclose(near.irradiance, np.array([4.0, 2.0, 0.0]) / (0.5 * lit.grid.size.min()) ** 2)
+    bright = place | {"position": centre.tolist(), "intensity": [1e12] * 3}
+    assert Scene.model_validate(SCENE | {"lights": [bright]}).looks(1).lights[0].irradiance == (1e12,) * 3
     for wrong in ({}, place | {"toward": [0, 1, 0]}):
         with pytest.raises(ValidationError, match="expected either a direction"):
             LightSettings.model_validate(wrong)

@@ -323,6 +323,9 @@ def run(
     scene = _scene(scene_name, scale, frames)
     single = orders == "single" or network is not None
     camera = scene.camera if resolution is None else scene.camera.model_copy(update={"resolution": resolution})
+    if film_file:  # whose width must be even
+        width = 2 * max(round(0.5 * camera.resolution * camera.aspect), 1)
+        camera = camera.model_copy(update={"aspect": width / camera.resolution})
     if camera.perspective and single:
         raise WlmError(f"{scene_name}: camera.perspective: expected false for six-way lightmaps, found true")
     scene = scene.model_copy(update={"camera": camera})
@@ -334,7 +337,6 @@ def run(
     with console.running("run", unit="frame") as progress:
         made = frames_of(scene, lighting, white=white, device=device, progress=progress)
         if film_file:
-            width = max(round(camera.resolution * camera.aspect), 1)
             with film(output, camera.resolution, width, scene.rate) as add:
                 seconds, smoke = write_all(made, lambda number, pixels: add(pixels))
         else:

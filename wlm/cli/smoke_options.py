@@ -1,5 +1,6 @@
 """Options, output files and tables that the commands of `wlm smoke` have in common."""
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -139,9 +140,11 @@ def _pairs(option: str, texts: Sequence[str] | None, names: Sequence[str]) -> di
 
 def _float(option: str, text: str) -> float:
     try:
-        return float(text)
+        if math.isfinite(value := float(text)):
+            return value
     except ValueError:
-        raise WlmError(f"{option}: expected a number, got {text!r}") from None
+        pass
+    raise WlmError(f"{option}: expected a finite number, got {text!r}")
 
 
 def vector(option: str, text: str) -> tuple[float, float, float]:
@@ -232,6 +235,7 @@ def write_lightmaps(
         errors: Whether the lightmaps state the error due to the step length.
     """
     from wlm.dispatch import Place, Task, run
+    from wlm.formats.reading import system_errors
     from wlm.smoke.data import NumberedFiles, write_six_way
     from wlm.smoke.frames import FrameMaker
     from wlm.smoke.lightmaps import axis_faults
@@ -249,7 +253,10 @@ def write_lightmaps(
         _check_folder(frames.path, output)
         factors = {"extinction": frames.extinction, "emission": frames.emission, "device": where.device[:4]}
         scene = dict(frames.options) if frames.scene is None else frames.scene.stored(frames.path)
-        key = {**settings, **factors, "scene": scene, "camera": camera.model_dump(mode="json")}
+        with system_errors(f"{frames.path}: cannot read the frames"):
+            stats = [(each.name, each.stat()) for each in frames.files.values()]
+        read = [(name, stat.st_size, stat.st_mtime_ns) for name, stat in stats]
+        key = {**settings, **factors, "scene": scene, "camera": camera.model_dump(mode="json"), "input": read}
         files = NumberedFiles(output, "six", ".exr", SHEET, run=key, resume=resume)
         if resume:
             done = len(files.done)

@@ -453,13 +453,15 @@ def _dimmed(name: str, heat: torch.Tensor, emission: float, voxel: float, warnin
 
 def _read_npz(path: Path, names: tuple[str | None, str | None], device: str, trust: bool) -> dict[str, Any]:
     density, temperature = (name or default for name, default in zip(names, (_DENSITY, _TEMPERATURE), strict=True))
-    wanted = {density: _DENSITY, temperature: _TEMPERATURE, "voxel": "voxel", "origin": "origin"}
+    wanted = {_DENSITY: density, _TEMPERATURE: temperature, "voxel": "voxel", "origin": "origin"}
+    if names[1] is None and density == temperature:
+        del wanted[_TEMPERATURE]
     needed = [density] if names[1] is None else [density, temperature]
 
     def choose(found: Sequence[str]) -> list[str]:
         if _BRICKS in found and density not in found:
-            return [name for name in found if name.removesuffix("_bricks") in (*wanted, _BRICKS, "shape")]
-        return [*needed, *(name for name in wanted if name in found and name not in needed)]
+            return [name for name in found if name.removesuffix("_bricks") in (*wanted.values(), _BRICKS, "shape")]
+        return [*needed, *(name for name in wanted.values() if name in found and name not in needed)]
 
     most = LARGEST if trust else VOXELS
     arrays = read_npz(path, choose, numbers=most, sure=VOLUME_BYTES if trust else 4 * SURE_VOXELS)
@@ -467,7 +469,7 @@ def _read_npz(path: Path, names: tuple[str | None, str | None], device: str, tru
         arrays = _in_place(path, arrays, most, device, trust)
         if missing := next((name for name in needed if name not in arrays), None):
             raise WlmError(f"{path}: {missing} is missing; found {', '.join(arrays) or 'nothing'}")
-    arrays = {wanted[name]: array for name, array in arrays.items()}
+    arrays = {field: arrays[name] for field, name in wanted.items() if name in arrays}
     for field, size in (("voxel", 1), ("origin", 3)):
         value = arrays.get(field)
         if value is None:

@@ -178,8 +178,11 @@ class Camera:
         if distance is None:
             # At least as far away as the box is large, which avoids an extreme perspective.
             distance = nearest + float(np.linalg.norm(size))
-            if not np.linalg.norm((target + distance * toward) - target) > _SHORTEST:
-                raise WlmError(f"camera: the smoke is too small, or too far from 0 for its size: {size} at {origin}")
+        if not np.linalg.norm((target + distance * toward) - target) > _SHORTEST:
+            raise WlmError(
+                f"camera: the smoke is too small, or too far from 0 for its size: {size} at {origin}, or the distance "
+                f"to the target is too short: {distance:.3g}"
+            )
         width = max(round(pixels * aspect), 1)
         shape = {"height": pixels, "width": width, "world_up": up, "perspective": perspective}
         camera = Camera.look_at(target + distance * toward, target, extent=1.0 if extent is None else extent, **shape)

@@ -29,7 +29,7 @@ from wlm.fluid.forcing import Fire, Turbulence, Wind
 from wlm.fluid.obstacles import Mesh, Trajectory, surface
 from wlm.smoke.camera import Camera
 from wlm.smoke.meshes import SUFFIXES, Surface, read_surface
-from wlm.smoke.shading import AnyLight, Light, PointLight, Ramp
+from wlm.smoke.shading import BRIGHTEST, AnyLight, Light, PointLight, Ramp
 from wlm.system import Checked
 
 _SHORTEST = 1e-12
@@ -89,6 +89,7 @@ _Positive = Annotated[float, Field(gt=0.0, le=_LARGEST)]
 _NotNegative = Annotated[float, Field(ge=0.0, le=_LARGEST)]
 _Keys = Annotated[tuple[tuple[_Number, _Number, _Number, _Number], ...], AfterValidator(_rising)]
 _Colour = tuple[_NotNegative, _NotNegative, _NotNegative]
+_Brightness = tuple[(Annotated[float, Field(ge=0.0, le=BRIGHTEST)],) * 3]
 _Share = Annotated[float, Field(ge=0.0, le=1.0)]
 _Albedo = tuple[_Share, _Share, _Share]
 _Count = Annotated[int, Field(ge=1, le=4096)]
@@ -452,9 +453,9 @@ class LightSettings(_Settings):
     """
 
     toward: _Direction | None = None
-    irradiance: _Colour = (4 * math.pi,) * 3
+    irradiance: _Brightness = (4 * math.pi,) * 3
     position: _Vector | None = None
-    intensity: _Colour = (1.0, 1.0, 1.0)
+    intensity: _Brightness = (1.0, 1.0, 1.0)
     radius: _NotNegative = 0.0
 
     @model_validator(mode="after")
@@ -477,7 +478,7 @@ class LightSettings(_Settings):
         away = np.asarray(self.position) - place
         length = float(np.linalg.norm(away))
         toward = away / length if length > _SHORTEST else np.array([0.0, 1.0, 0.0])
-        irradiance = np.asarray(self.intensity) / max(length, least) ** 2
+        irradiance = np.minimum(np.asarray(self.intensity) / max(length, least) ** 2, BRIGHTEST)
         return LightSettings(toward=tuple(toward.tolist()), irradiance=tuple(irradiance.tolist()))
 
 

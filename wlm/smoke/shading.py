@@ -11,7 +11,8 @@ import torch
 from wlm.fluid.volume import DensityVolume
 from wlm.smoke.camera import unit
 
-_BRIGHTEST = 1e12  # its products with any phase function are within float32
+BRIGHTEST = 1e12
+"""Largest irradiance or intensity: its products with any phase function are within float32."""
 
 
 @dataclass(frozen=True)
@@ -124,8 +125,8 @@ def half_sphere(count: int) -> np.ndarray:
 def checked_colour(name: str, colour: Sequence[float]) -> np.ndarray:
     """Checks that a colour is three numbers of at least 0 and returns it as float64 [3]."""
     values = np.asarray(colour, np.float64)
-    if values.shape != (3,) or not ((values >= 0) & (values <= _BRIGHTEST)).all():
-        raise ValueError(f"{name}: expected three numbers from 0 to {_BRIGHTEST:g}, got {colour}")
+    if values.shape != (3,) or not ((values >= 0) & (values <= BRIGHTEST)).all():
+        raise ValueError(f"{name}: expected three numbers from 0 to {BRIGHTEST:g}, got {colour}")
     return values
 
 

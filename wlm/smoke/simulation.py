@@ -235,13 +235,16 @@ def simulate(
 
     Raises:
         WlmError: As `make_solver`; an obstacle is too fast; the air blew up; a file is damaged or cannot be written; a
-            frame before the saved state is missing; or another process is writing the folder.
+            frame before the saved state, or its copy in the format of `volumes`, is missing; or another process is
+            writing the folder.
     """
     with locked(frames.path):
         scene, checkpoint = frames.scene, frames.path / CHECKPOINT
         missing = sorted(set(range(1, scene.frames + 1)) - set(frames.numbers))
         saved = resume and checkpoint.exists()
+        suffix, _, raw = (volumes or "").partition("-")
         if resume and not saved and not missing:
+            _require_copies(frames, scene.frames, suffix)
             return scene.frames + 1
         if solver is None:
             solver = make_solver(scene, device=device)
@@ -255,6 +258,7 @@ def simulate(
                 f"{frames.path}: cannot resume after frame {frame - 1}: {frames.file(missing[0]).name} is missing;"
                 " start anew without --resume"
             )
+        _require_copies(frames, frame - 1, suffix)
         first, meter, pace = frame, Meter(progress, "simulate", scene.frames), Pace(checkpoint_every)
         for frame in range(first, scene.frames + 1):
             begin = time.perf_counter()
@@ -263,7 +267,6 @@ def simulate(
                     solver.check()
                     if volumes is not None:
                         velocity = solver.velocity.numpy() * (scene.grid.cell / solver.duration)
-                        suffix, _, raw = volumes.partition("-")
                         copy = frames.file(frame).with_suffix(f".{suffix}")
                         save_volume(
                             copy,
@@ -292,6 +295,17 @@ def simulate(
         if first <= scene.frames or begun == scene.frames * _steps_per_frame(scene, solver):
             checkpoint.unlink(missing_ok=True)
         return min(first, scene.frames + 1)
+
+
+def _require_copies(frames: Frames, last: int, suffix: str) -> None:
+    """Checks that the finished frames up to a last one also exist in the format of a suffix, "" for none: the velocity
+    of their air is lost."""
+    copies = [frames.file(frame).with_suffix(f".{suffix}") for frame in range(1, last + 1) if suffix]
+    if (missing := next((copy for copy in copies if not copy.exists()), None)) is not None:
+        raise WlmError(
+            f"{frames.path}: cannot resume with --volumes {suffix}: {missing.name} of a finished frame is missing; "
+            "start anew without --resume, or resume without --volumes"
+        )
 
 
 def advance(scene: Scene, solver: fluid.Solver, frame: int) -> None:
