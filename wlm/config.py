@@ -171,8 +171,7 @@ def _first_problem(cls: type[BaseModel], error: ValidationError, as_option: bool
         name = [] if ": " in message or problem["type"] == "value_error" else [problem["type"]]
         text = ": ".join(filter(None, [".".join([*map(str, problem["loc"]), *name]), message]))
     else:
-        expected = message.replace("Input should be", "expected", 1)
-        text = f"{field}: {expected}, got {_shown(problem['input'])}"
+        text = f"{field}: {message.replace('Input should be', 'expected', 1)}, got {_shown(problem['input'])}"
     return text if len(problems) == 1 else f"{text} (and {len(problems) - 1} more)"
 
 

@@ -214,6 +214,7 @@ def test_what_is_refused(device: str):
     for arguments, message in (
         ((colour / 0.0, raster, clip, triangle), "colour: expected finite numbers, found nan"),
         ((colour, raster, clip[None], triangle), r"raster.depth: expected float32 \[1, any, any\], got .* \(8, 9\)"),
+        ((colour, replace(raster, triangle=raster.depth), clip, triangle), r"raster.triangle: expected int32 \[8, 9\]"),
         ((colour, raster, clip, triangle[:1]), "triangle: expected the 2 triangles that were drawn, got 1"),
         ((colour, raster, clip[:3], triangle), "triangle: expected numbers from 0 to 2, found 3"),
     ):

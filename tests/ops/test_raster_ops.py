@@ -1,5 +1,7 @@
 """Drawing for torch: a picture and its gradients end to end, against ray casts, and what is refused."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -119,6 +121,7 @@ def test_what_is_refused(device: str):
     clip, triangle, uv = _mesh(device)
     image = torch.rand(2, 2, 3, device=device)
     raster = ops.rasterize(clip, triangle, 3, 4)
+    cut = replace(raster, triangle=raster.triangle[:2])
     low = triangle.clone()
     low[0, 1] = -1
     for call, message in (
@@ -127,6 +130,7 @@ def test_what_is_refused(device: str):
         (lambda: ops.rasterize(clip, triangle, 0, 4), "height: expected 1 to 16384 pixels, got 0"),
         (lambda: ops.texture(image[:0], uv), r"image: expected at least one texel and one channel, got \(0, 2, 3\)"),
         (lambda: ops.rasterize(clip, triangle.to("meta"), 3, 4), "triangle: expected a tensor on .* meta"),
+        (lambda: ops.interpolate(uv, triangle, cut), r"raster.triangle: expected int32 \[3, 4\], got .* \(2, 4\)"),
         (lambda: ops.interpolate(uv, triangle[:3], raster), "triangle: expected the 32 triangles that were drawn"),
         (lambda: ops.texture(image, uv, filter="cubic"), "filter: expected linear or nearest, got 'cubic'"),
     ):

@@ -78,9 +78,9 @@ class _Mlp(torch.autograd.Function):
                 to_warp(on_x, network.vec_in),
                 *(to_warp(layer, network.vec_hidden) for layer in (h1, h2, d1, d2)),
             )
-        # Matrix products over the inputs: torch's implementation is the fastest on either device.
-        on_hidden = torch.cat([_weights(x, d1), _weights(h1, d2)], 1)
-        return on_x, on_hidden, _weights(h2, grad_y), None
+        # Matrix products over the inputs: torch's implementation is the fastest on either device, in single floats.
+        with torch.autocast(x.device.type, enabled=False):
+            return on_x, torch.cat([_weights(x, d1), _weights(h1, d2)], 1), _weights(h2, grad_y), None
 
 
 def _arrays(network: MlpKernels, x: torch.Tensor, hidden: torch.Tensor, output: torch.Tensor) -> list:

@@ -136,6 +136,7 @@ def interpolate(
         raise ValueError(f"triangle: expected the {raster.count} triangles that were drawn, got {len(triangle)}")
     images = (len(attribute),) if batched else (None,) * (barycentric.ndim - 3)
     check("raster.barycentric", barycentric, (*images, None, None, 2), attribute.device)
+    check("raster.triangle", visible, barycentric.shape[:-1], attribute.device, torch.int32)
     if derivatives and raster.derivative is None:
         raise ValueError("raster.derivative: expected derivatives, got None: use rasterize(..., derivative=True)")
     if batched:
@@ -144,12 +145,8 @@ def interpolate(
         visible = torch.where(visible < 0, visible, visible + number * len(triangle))
         triangle = (triangle + number * attribute.shape[1]).reshape(-1, 3)
         attribute = attribute.reshape(-1, attribute.shape[2])
-    if barycentric.ndim == 3:
-        values = _Interpolate.apply(attribute, triangle, visible, barycentric)
-    else:
-        rows = -1, barycentric.shape[-2]
-        values = _Interpolate.apply(attribute, triangle, visible.reshape(rows), barycentric.reshape(*rows, 2))
-        values = values.reshape(*barycentric.shape[:-1], attribute.shape[1])
+    values = _Interpolate.apply(attribute, triangle, visible.flatten(0, -2), barycentric.flatten(0, -3))
+    values = values.reshape(*barycentric.shape[:-1], attribute.shape[1])
     return (values, _slopes(attribute, triangle, visible, raster.derivative)) if derivatives else values
 
 

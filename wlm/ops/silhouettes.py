@@ -51,6 +51,7 @@ def antialias(colour: torch.Tensor, raster: Raster, clip: torch.Tensor, triangle
     if raster.count not in (None, len(triangle)):
         raise ValueError(f"triangle: expected the {raster.count} triangles that were drawn, got {len(triangle)}")
     check("raster.depth", raster.depth, (*images, None, None), device)
+    check("raster.triangle", raster.triangle, raster.depth.shape, device, torch.int32)
     check("colour", colour, (*raster.depth.shape, None), device)
     check_finite(colour=colour)
     if not batched:

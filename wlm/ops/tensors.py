@@ -14,22 +14,24 @@ Shape = tuple[int | EllipsisType | None, ...]
 """Sizes of a tensor's axes; None allows any size, and a leading `...` any number of axes."""
 
 
-def check(name: str, tensor: torch.Tensor, shape: Shape, device: torch.device | None = None) -> None:
-    """Checks that a tensor is float32 and has the given shape and device; None allows any device of Warp. Raises a
-    ValueError if it isn't a dense torch tensor, its shape, type or device doesn't fit, or torch.func is active."""
-    _check_tensor(name, tensor, "float32", shape)
-    if tensor.dtype != torch.float32 or not _fits(tensor, shape):
-        hint = ": use its float()" if tensor.is_floating_point() and tensor.dtype != torch.float32 else ""
-        raise ValueError(f"{name}: expected float32 {_text(shape)}, got {tensor.dtype} {tuple(tensor.shape)}{hint}")
+def check(
+    name: str, tensor: torch.Tensor, shape: Shape, device: torch.device | None = None, kind: torch.dtype = torch.float32
+) -> None:
+    """Checks that a tensor has the given type, shape and device; None allows any device of Warp. Raises a ValueError if
+    it isn't a dense torch tensor, its shape, type or device doesn't fit, or torch.func is active."""
+    _check_tensor(name, tensor, wanted := f"{kind} {_text(shape)}".removeprefix("torch."))
+    if tensor.dtype != kind or not _fits(tensor, shape):
+        hint = ": use its float()" if tensor.is_floating_point() and tensor.dtype != kind == torch.float32 else ""
+        raise ValueError(f"{name}: expected {wanted}, got {tensor.dtype} {tuple(tensor.shape)}{hint}")
     _check_device(name, tensor, device)
 
 
 def check_index(name: str, index: torch.Tensor, count: int, shape: Shape, device: torch.device) -> None:
     """Checks a tensor of indices from 0 to `count` - 1; values are not checked while a CUDA graph is captured. Raises a
     ValueError as `check` does, or if a number doesn't fit."""
-    _check_tensor(name, index, "int32 or int64", shape)
+    _check_tensor(name, index, wanted := f"int32 or int64 {_text(shape)}")
     if index.dtype not in (torch.int32, torch.int64) or not _fits(index, shape):
-        raise ValueError(f"{name}: expected int32 or int64 {_text(shape)}, got {index.dtype} {tuple(index.shape)}")
+        raise ValueError(f"{name}: expected {wanted}, got {index.dtype} {tuple(index.shape)}")
     _check_device(name, index, device)
     if index.numel() and not _capturing(index):
         low, high = torch.stack(index.aminmax()).tolist()
@@ -84,10 +86,10 @@ def optional_array(tensor: torch.Tensor | None, dimensions: int, dtype: Any, dev
     return to_warp(tensor, dtype)
 
 
-def _check_tensor(name: str, tensor: torch.Tensor, types: str, shape: Shape) -> None:
+def _check_tensor(name: str, tensor: torch.Tensor, wanted: str) -> None:
     if not isinstance(tensor, torch.Tensor):
         kind = f"{type(tensor).__module__}.{type(tensor).__name__}".removeprefix("builtins.")
-        raise ValueError(f"{name}: expected a torch tensor, {types} {_text(shape)}, got {kind}: use torch.as_tensor")
+        raise ValueError(f"{name}: expected a torch tensor, {wanted}, got {kind}: use torch.as_tensor")
     if tensor.layout != torch.strided:
         raise ValueError(f"{name}: expected a dense tensor, got {tensor.layout}: use its to_dense()")
     # torch's own error for such a call tells nothing to a caller.

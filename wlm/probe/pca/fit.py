@@ -132,14 +132,12 @@ def fit_components(
     if best.table.directions is not None:
         label = _cheapest(unit, logarithm, best)
         best = _refined(unit, logarithm, label, target, _LAST)
-    while True:  # the errors of plans are predictions
+    while True:  # the errors of plans are predictions, far too small for magnitudes without bits
         components, error = _coded(values, light, hours, best)
         if error <= enough or best.error > target.error or not best.error:
             return components, error
-        # The error of magnitudes without bits is exponential.
-        wanted = max(0.9 * target.error * enough / error, 0.5 * best.error)
-        target = target._replace(error=min(wanted, 0.99 * best.error))
-        best = _planned(best.table, target)
+        lower = min(max(0.9 * target.error * enough / error, 0.5 * best.error), 0.99 * best.error)
+        best = _planned(best.table, target := target._replace(error=lower))
 
 
 def _worth(plan: _Plan, target: _Target) -> tuple[float, float, int]:
