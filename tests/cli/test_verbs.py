@@ -40,6 +40,8 @@ class Tiny(Settings):
     """Store smaller levels."""
     kind: Literal["a", "b"] = "a"
     """Kind of the fit."""
+    bits: Literal[8, 16] = 16
+    """Bits of a number."""
     pair: tuple[float, float] = (1.0, 2.0)
     """Two numbers."""
     least: float | None = None
@@ -67,9 +69,9 @@ def run(*words: str) -> str:
 
 
 def test_options_are_those_of_the_fields():
-    run("--steps", "7", "--mips", "--kind", "b", "--pair", "3,4", "--least", "0.5", "--inner-rate", "0.1")
+    run(*"--steps 7 --mips --kind b --bits 8 --pair 3,4 --least 0.5 --inner-rate 0.1".split())
     assert given == {
-        "steps": "7", "mips": True, "kind": "b", "pair": ["3", "4"], "least": "0.5", "inner": {"rate": "0.1"}
+        "steps": "7", "mips": True, "kind": "b", "bits": 8, "pair": ["3", "4"], "least": "0.5", "inner": {"rate": "0.1"}
     }  # fmt: skip
     run("--no-mips")
     assert given == {"mips": False}
@@ -86,6 +88,7 @@ def test_options_are_those_of_the_fields():
     [
         (("--steps", "0"), "--steps: expected greater than or equal to 1, got '0'"),
         (("--kind", "c"), "--kind: expected 'a' or 'b'"),
+        (("--bits", "9"), "--bits: expected 8 or 16"),
         (("--pair", "1"), "--pair"),
     ],
 )

@@ -116,7 +116,9 @@ def _parameter(field: _Field) -> inspect.Parameter:
     elif get_origin(kind) is tuple:
         annotation = Annotated[str | None, typer.Option(option, metavar="N,N", callback=_numbers, **words)]
     else:
-        annotation = Annotated[str | None, typer.Option(option, metavar=_metavar(kind), **words)]
+        # A choice of numbers is compared with numbers, not with text.
+        form: Any = int if get_origin(kind) is Literal and isinstance(get_args(kind)[0], int) else str
+        annotation = Annotated[form | None, typer.Option(option, metavar=_metavar(kind), **words)]
     return inspect.Parameter(field.parameter, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation)
 
 
