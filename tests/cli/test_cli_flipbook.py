@@ -153,6 +153,7 @@ def test_wrong_options_are_one_line(baked, tmp_path):
         ([*book, "--engine", "unity", "--layout", "o3de"], "layout: expected unity for unity, got o3de"),
         ([*book, "--rate", 0], "--rate: expected a number above 0, got 0"),
         ([*textures, "--engine", "three"], "--engine needs a folder as the output"),
+        ([*textures, "--rate", 12], "--rate needs a folder as the output"),
         ([*textures[:-1], tmp_path / "a.jpg"], "ends in .exr or .png or .tga"),
     ):
         assert call(*words, code=2) == "" and line in call.stderr.splitlines()[-1]

@@ -110,6 +110,8 @@ def test_directions_survive(tmp_path: Path, suffix: str):
     swapped = "left,top,back,alpha:right,bottom,front"
     read_flipbook([*paths], swapped, rows=1, columns=2, notes=notes)
     assert "--from unity better" in notes[-1]
+    read_flipbook([*paths][::-1], rows=1, columns=2, notes=notes)
+    assert "it fits --from left,bottom,front,emission:right,top,back,alpha better" in notes[-1]
     # Files of other programs state nothing: layout, cells and alpha are seen in the light.
     if suffix != ".exr":
         for path in paths:

@@ -171,7 +171,7 @@ def flipbook(
     in_files = bool(output.suffix) and not output.is_dir()
     if in_files:
         check_output(output, *_TEXTURES)
-        for option, given in (("engine", engine), ("shader", shader)):
+        for option, given in (("engine", engine), ("shader", shader), ("rate", rate)):
             if given is not None:
                 raise WlmError(f"--{option} needs a folder as the output, got the file {output}")
         gain = 1.0 if gain is None and output.suffix.lower() == ".exr" else gain

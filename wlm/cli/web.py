@@ -28,9 +28,9 @@ def web(
     key: Key = None,
     time: Time = None,
     hours: Annotated[
-        int, typer.Option(min=1, help="Most original lightmaps in the page, evenly spread over the times.")
-    ] = 6,
-    rate: Annotated[float, typer.Option(help="Frames per second at which smoke is played.")] = 30.0,
+        int | None, typer.Option(min=1, help="Most original lightmaps in the page, at evenly spread times; default 6.")
+    ] = None,
+    rate: Annotated[float | None, typer.Option(help="Frames per second at which smoke is played; default 30.")] = None,
     network: Network = None,
     volume: VolumeSettings = None,
     up: Up = "y",
@@ -39,11 +39,11 @@ def web(
     begin(output, ".html")
     from wlm.export import write_page, write_viewer
 
-    options = {"mesh": mesh, "original": original, "key": key, "time": time, "network": network}
-    options["volume"] = parse_volume(volume) or None
+    options = {"mesh": mesh, "original": original, "key": key, "time": time, "hours": hours, "rate": rate}
+    options |= {"network": network, "volume": parse_volume(volume) or None}
     if files:
         with running("page") as progress:
-            size = write_page(output, files, **options, hours=hours, rate=rate, up=up, progress=progress)
+            size = write_page(output, files, **options, up=up, progress=progress)
     elif given := [name for name, value in options.items() if value is not None]:
         raise WlmError(f"--{given[0]}: has no meaning for a viewer: expected a file, found none")
     else:

@@ -100,6 +100,7 @@ def test_what_has_no_page_is_said_in_one_line(tmp_path):
     for files, options, said in (
         ([FILES / "smoke.wlm"], {}, "no picture of its own"),
         ([FILES / "lightmap.wlm"], {"key": "sh"}, "--key"),
+        ([FILES / "lightmap.wlm"], {"rate": 20.0}, "--rate has no meaning for this file"),
         ([tmp_path / "probe.wlm"], {}, "--original"),
         ([tmp_path / "five.wlm"], {}, "spherical harmonics"),
         ([tmp_path], {}, "expected a .wlm file"),

@@ -43,8 +43,8 @@ def make_page(
     original: str | os.PathLike[str] | None = None,
     key: str | None = None,
     time: float | None = None,
-    hours: int = 6,
-    rate: float = 30.0,
+    hours: int | None = None,
+    rate: float | None = None,
     network: str | os.PathLike[str] | None = None,
     volume: Mapping[str, Any] | None = None,
     up: Literal["y", "z"] = "y",
@@ -60,8 +60,8 @@ def make_page(
         original: The input that was compressed, to compare with: a lightmap set, a lightmap, or a probe file.
         key: Name of the array to read from an original probe file with several arrays.
         time: Hour of the day to show of light probes that have several.
-        hours: Largest number of original lightmaps in the page, at evenly spread times.
-        rate: Playback speed of smoke, in frames per second.
+        hours: Largest number of original lightmaps in the page, at evenly spread times; None: 6.
+        rate: Playback speed of smoke, in frames per second; None: 30.
         network: Network by which the browser makes six-way lightmaps of volumes, a file or "fast", the one that ships
             with wlm; None: it makes them by a coarse march, as `wlm.smoke.predict` does.
         volume: Options of `wlm.smoke.load_frames` for volumes, such as {"extinction": 14.0}.
@@ -79,10 +79,9 @@ def make_page(
     module, function = _PAGES[kind]
     make = getattr(import_module(module), function)
     known = signature(make).parameters
-    given: dict[str, Any] = {"mesh": mesh, "original": original, "key": key, "time": time}
-    given |= {"network": network, "volume": volume}
+    given: dict[str, Any] = {"mesh": mesh, "original": original, "key": key, "time": time, "hours": hours}
+    given |= {"rate": rate, "network": network, "volume": volume}
     given = {name: value for name, value in given.items() if value is not None}
     check_options(Path(files[0]), tuple(given), tuple(known))
-    # These have defaults for every kind.
-    given |= {"hours": hours, "rate": rate, "up": up, "progress": progress}
+    given |= {"up": up, "progress": progress}  # they have defaults for every kind
     return make(paths, **{name: value for name, value in given.items() if name in known})

@@ -263,12 +263,12 @@ def _layout(
 
 
 def _best(frames: Sequence[torch.Tensor], others: Sequence[Layout]) -> tuple[str | None, float, float]:
-    """Finds the layout whose directions fit the light of two textures [N, C, H, W]. Besides the known layouts, the
-    variants of `others` with two opposite directions exchanged are tried. Returns its text for `parse_layout`, None if
-    no layout fits; how well it fits; and how well the first of `others` does."""
+    """Finds the layout whose directions fit the light of two textures [N, C, H, W]. Besides the known layouts, these
+    with the textures exchanged, and the variants of `others` with two opposite directions exchanged, are tried. Returns
+    its text for `parse_layout`, None if no layout fits; how well it fits; and how well the first of `others` does."""
     counts = [each.shape[1] for each in frames]
     centres = light_centres(torch.cat(list(frames), 1))
-    tried = [*LAYOUTS.values()]
+    tried = [*LAYOUTS.values(), *(layout[::-1] for layout in LAYOUTS.values())]
     for layout in others:
         for one, other in zip(DIRECTIONS[::2], DIRECTIONS[1::2], strict=True):
             swap = {one: other, other: one}
