@@ -168,6 +168,8 @@ def test_info_says_what_is_in_the_file(fitted, carrying):
         (["decode", "{fit}", "-o", "{tmp}/f.npz", "--positions", "{bad}"], "position[0]: expected finite"),
         (["decode", "{fit}", "-o", "{tmp}/f.exr", "--positions", "{set}"], "ends in .npz or .json"),
         (["decode", "{fit}", "-o", "{tmp}/f.npz", "--positions", "{set}", "--convention", "quake"], "convention"),
+        (["decode", "{fit}", "-o", "{other}", "--positions", "{other}"], "expected another file than the input"),
+        (["evaluate", "{fit}", "{bad}", "--json", "{bad}"], "expected another file than the input"),
         (["evaluate", "{fit}", "absent.npz"], "absent.npz: cannot read the arrays: No such file"),
         (["probe", "volume", "{fit}", "-o", "{tmp}/out"], "stores no positions"),
         (["probe", "volume", "{fit}", "{other}", "-o", "{tmp}/out"], "expected the 160 probes of"),

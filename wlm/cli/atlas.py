@@ -111,7 +111,7 @@ def evaluate(
     device: opt.Device = "cpu",
 ) -> None:
     """Compare compressed lightmaps with the originals on rendered views of the scene."""
-    console.begin(json_path, ".json")
+    console.begin(json_path, ".json", inputs=[lightmaps])
     from wlm.atlas import evaluate
     from wlm.interop import check_device
     from wlm.system import load

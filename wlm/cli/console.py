@@ -208,10 +208,13 @@ def quiet_warp() -> None:
     _announce_compilation()
 
 
-def begin(output: Path | None, *suffixes: str) -> None:
-    """Checks the output file of a command, if it has one, see `check_output`, and starts Warp, see `quiet_warp`."""
+def begin(output: Path | None, *suffixes: str, inputs: Sequence[Path | None] = ()) -> None:
+    """Checks the output file of a command, if it has one, see `check_output`: it is none of the files in `inputs`. Then
+    starts Warp, see `quiet_warp`."""
     if output is not None:
         check_output(output, *suffixes)
+        if output.exists() and any(path and path.exists() and path.samefile(output) for path in inputs):
+            raise WlmError(f"{output}: expected another file than the input, which would be replaced")
     quiet_warp()
 
 

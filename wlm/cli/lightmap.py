@@ -131,7 +131,7 @@ def evaluate(
     The error is also measured as a renderer shows the light: filtered, beside charts, between stored times, across
     tiles, over time, and in views of the set's mesh.
     """
-    console.begin(json_path, ".json")
+    console.begin(json_path, ".json", inputs=[set_path, set_path / "set.json"])
     from wlm.interop import check_device
     from wlm.lightmap import evaluate
     from wlm.system import load

@@ -119,7 +119,7 @@ def evaluate(
 
     --volume and --views compare the light at one hour, --time.
     """
-    console.begin(json_path, ".json")
+    console.begin(json_path, ".json", inputs=[probes_path])
     from wlm.cli.probe_volume import score_pictures, score_walks, show_pictures, show_walks
     from wlm.probe import evaluate, load
     from wlm.system import load as load_model
@@ -140,9 +140,8 @@ def evaluate(
     walks = score_walks(*one, device) if volume else {}
     if json_path is not None:
         content = report.to_json() | ({"volume": walks} if walks else {})
-        console.write_json(
-            json_path, content | ({"views": [score.to_json() for score in pictures]} if pictures else {})
-        )
+        content |= {"views": [score.to_json() for score in pictures]} if pictures else {}
+        console.write_json(json_path, content)
     _show_report(file, model, report)
     console.note(f"{probes_path}: {probes.reading}")
     show_walks(walks)
@@ -166,7 +165,7 @@ def decode(
     Given positions of the same number and bounding box as the compressed probes are taken for these probes, in order.
     Then probes without light (dead probes, such as those in walls) decode to zero.
     """
-    console.begin(output, ".npz", ".json")
+    console.begin(output, ".npz", ".json", inputs=[positions, original])
     from wlm.probe import load_positions, save_probes
     from wlm.probe.places import positions_of
     from wlm.system import load
@@ -180,9 +179,8 @@ def decode(
     save_probes(output, position, values, convention=convention)
     facts = {"file": output, "positions": len(position), "positions are": "the probes" if own else "other points"}
     zero = int((~model.live).sum()) if own else 0
-    console.show_facts(
-        str(file), facts | {"dead probes": zero, "mean": float(values.mean()), "largest": float(values.max())}
-    )
+    facts |= {"dead probes": zero, "mean": float(values.mean()), "largest": float(values.max())}
+    console.show_facts(str(file), facts)
 
 
 def export(
