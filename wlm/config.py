@@ -143,16 +143,14 @@ _Loader.add_constructor("tag:yaml.org,2002:int", _Loader.construct_yaml_int)
 
 
 def _yaml_problem(error: Exception) -> str:
-    problem = getattr(error, "problem", None)
-    mark = getattr(error, "problem_mark", None)
+    problem, mark = getattr(error, "problem", None), getattr(error, "problem_mark", None)
     if problem is None:
         return one_line(error)
     return problem if mark is None else f"{problem} (line {mark.line + 1}, column {mark.column + 1})"
 
 
 def _first_problem(cls: type[BaseModel], error: ValidationError, as_option: bool) -> str:
-    problems = error.errors(include_url=False)
-    problem = problems[0]
+    problem, *others = error.errors(include_url=False)
     message = problem["msg"].removeprefix("Value error, ")
     field = ".".join(str(part) for part in problem["loc"]) or "settings"
     if as_option:
@@ -170,9 +168,10 @@ def _first_problem(cls: type[BaseModel], error: ValidationError, as_option: bool
         # A check of several fields together: its message, or else its type, names one of them.
         name = [] if ": " in message or problem["type"] == "value_error" else [problem["type"]]
         text = ": ".join(filter(None, [".".join([*map(str, problem["loc"]), *name]), message]))
+        text = text.replace("_", "-") if as_option else text
     else:
         text = f"{field}: {message.replace('Input should be', 'expected', 1)}, got {_shown(problem['input'])}"
-    return text if len(problems) == 1 else f"{text} (and {len(problems) - 1} more)"
+    return f"{text} (and {len(others)} more)" if others else text
 
 
 def _suggestion(cls: type[BaseModel], location: tuple[int | str, ...]) -> str:

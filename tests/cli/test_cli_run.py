@@ -12,9 +12,11 @@ from builders.running import call, fails, png
 from builders.smoke_plumes import SCENE, SPHERE
 from PIL import Image
 
+import wlm
 from wlm.formats.film import film
 from wlm.inspection import inspect
 from wlm.smoke.codec import shipped
+from wlm.view import scene_run
 
 
 @pytest.fixture(scope="module")
@@ -58,6 +60,7 @@ def test_errors_are_one_line_and_leave_no_folder(room, tmp_path):
     assert "expected --output DIR, or --window" in fails("run", room)
     assert "--samples has no meaning with --window" in fails("run", room, "--window", "--samples", 1)
     assert "expected a group among sky, sun" in fails("run", room, "-o", out, "--weight", "lamp=1")
+    assert "hours: expected hours that differ" in fails("run", room, "-o", out, "--hours", "7.001,12,7.004")
     missing = day_scenes.write_file(room.with_name("missing.yaml"), light="none.wlm")
     assert "light: there is no file" in fails("run", missing, "-o", out)
     (room.parent / "smoke" / "bad").mkdir()
@@ -69,6 +72,15 @@ def test_errors_are_one_line_and_leave_no_folder(room, tmp_path):
     out.mkdir()
     (out / "mine.txt").touch()
     assert "found other files" in fails("run", room, "-o", out, *SMALL)
+
+
+def test_the_report_of_a_stopped_run_says_so(room, tmp_path):
+    def stop(_):
+        raise KeyboardInterrupt
+
+    with wlm.scene.load(room) as scene, pytest.raises(KeyboardInterrupt):
+        scene_run.run(scene, tmp_path / "out", height=36, width=64, samples=1, frames=0, hours=[7.0], progress=stop)
+    assert json.loads((tmp_path / "out" / "report.json").read_text())["unfinished"]
 
 
 HOT = {"extinction": 8.0, "albedo": [0.9, 0.8, 0.6], "emission": 3.0, "glow": [[0, 0, 0, 0], [0.5, 2, 0.5, 0]]}

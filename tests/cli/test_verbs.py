@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import pytest
 import typer
+from builders.checks import error_of
 from builders.contract import FILES
 from builders.running import call, fails
 from PIL import Image
@@ -19,6 +20,7 @@ from wlm.cli.verbs import SYSTEMS, VERBS, first_argument, functions, variant
 from wlm.errors import WlmError
 from wlm.formats.exr import write_exr
 from wlm.inspection import input_system
+from wlm.lightmap import Profile
 from wlm.system import _PACKAGES, Settings
 
 MOST_COMMANDS, MOST_OPTIONS = 25, 15
@@ -94,6 +96,8 @@ def test_options_are_those_of_the_fields():
 )
 def test_wrong_settings_are_named_as_options(words, line):
     assert line in run(*words)
+    order = {"quantise_from": "0.9", "freeze_from": "0.5"}
+    assert error_of(Profile(name="").override, order, "--") == "--quantise-from: expected at most freeze-from"
 
 
 def test_the_systems_are_those_of_the_files():

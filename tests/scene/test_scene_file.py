@@ -93,6 +93,7 @@ def test_one_line_names_the_key(room, old, new, line):
     with pytest.raises(WlmError) as error:
         wlm.scene.load(edited(room, old, new))
     assert line in str(error.value) and "\n" not in str(error.value) and str(room.parent) in str(error.value)
+    assert "--trust" not in str(error.value)  # which no command of scenes has
 
 
 def test_probes_are_needed_by_what_they_light(room):

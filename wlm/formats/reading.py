@@ -169,12 +169,13 @@ def damaged(message: str, *errors: type[Exception]) -> Iterator[None]:
         raise WlmError(f"{message}: {one_line(error, 120) or type(error).__name__}") from error
 
 
-def named_file(document: str | os.PathLike[str], name: str, where: str, trust: bool = False) -> Path:
+def named_file(document: str | os.PathLike[str], name: str, where: str, trust: bool | None = False) -> Path:
     """Returns the path of a file that a document names, which must be inside the document's folder, links resolved,
     unless the document is trusted.
 
     An untrusted document could otherwise make this package read any file and copy it into an output. `name` is relative
-    to the folder of the document; `where` names the document and its field in messages.
+    to the folder of the document; `where` names the document and its field in messages. `trust` is None for documents
+    that cannot be trusted.
     """
     if len(name) > _LONGEST_NAME:
         raise WlmError(f"{where}: expected a name of at most {_LONGEST_NAME} characters, found {len(name)}")
@@ -187,8 +188,6 @@ def named_file(document: str | os.PathLike[str], name: str, where: str, trust: b
     except (OSError, ValueError, RuntimeError) as error:  # a name that is too long or has a NUL, or a cycle of links
         raise WlmError(f"{where}: cannot resolve the file name {name}: {error}") from error
     if not inside:
-        raise WlmError(
-            f"{where}: expected a file within {folder}, found {name}; trust=True (--trust on the command line) "
-            "allows files elsewhere, for documents from a trusted author"
-        )
+        hint = "; trust=True (--trust on the command line) allows files elsewhere, for documents from a trusted author"
+        raise WlmError(f"{where}: expected a file within {folder}, found {name}{'' if trust is None else hint}")
     return path

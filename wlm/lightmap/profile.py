@@ -81,7 +81,7 @@ class Profile(Settings):
     @model_validator(mode="after")
     def _stages_in_order(self) -> "Profile":
         if self.quantise_from > self.freeze_from:
-            raise ValueError("quantise_from must not be greater than freeze_from")
+            raise ValueError("quantise_from: expected at most freeze_from")
         return self
 
     def for_times(self, times: int) -> "Profile":

@@ -188,7 +188,7 @@ def load(path: str | os.PathLike[str]) -> Scene:
     given = load_settings(SceneFile, path)
 
     def file(key: str, name: str) -> Path:
-        found = named_file(path, name, f"{path}: {key}")
+        found = named_file(path, name, f"{path}: {key}", None)
         if not found.exists():
             raise WlmError(f"{path}: {key}: there is no file or folder {found}")
         return found

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import numpy as np
 
 from wlm.errors import WlmError
 from wlm.formats.film import film
-from wlm.formats.folder import claim, write_index
+from wlm.formats.folder import UNFINISHED, claim, write_index
 from wlm.lightmap.groups import Weight
 from wlm.metrics import Pictures
 from wlm.scene.content import Scene
@@ -71,16 +72,18 @@ def run(
     frames = round(RATE * scene.day.seconds) if frames is None else frames
     name = "film.mp4" if find_spec("imageio_ffmpeg") else "film.webp"
     _check(scene, frames, height, width, name)
-    hours = (list(scene.originals) or [0.0, 6.0, 12.0, 18.0]) if hours is None else list(hours)
+    hours = sorted(set(scene.originals or (0.0, 6.0, 12.0, 18.0)) if hours is None else set(hours))
     if bad := [hour for hour in hours if not 0.0 <= hour < 48.0]:
         raise WlmError(f"hours: expected 0 to 48, got {bad[0]:g}")
+    if bad := [pair for pair in pairwise(hours) if f"{pair[0]:.2f}" == f"{pair[1]:.2f}"]:
+        raise WlmError(f"hours: expected hours that differ in two decimals, which name their pictures, got {bad[0]}")
     claim(folder, REPORT, FORMAT)
     report: dict[str, Any] = {"format": FORMAT, "scene": scene.title, "device": device}
     report |= {"width": width, "height": height, "samples": samples}
     with Renderer(scene, height, width, device, samples=samples) as renderer:
         renderer.pages.set_weights(weights or {})
         folder.mkdir(exist_ok=True)
-        write_index(folder / REPORT, report)
+        write_index(folder / REPORT, report | {UNFINISHED: True})
         for old in (*folder.glob("view_*h.png"), *folder.glob("film.*")):
             old.unlink()
         meter = Meter(progress, "pictures", len({*hours, *scene.originals}))
@@ -99,11 +102,8 @@ def _check(scene: Scene, frames: int, height: int, width: int, name: str) -> Non
     if frames and name.endswith(".mp4") and (height % 2 or width % 2):
         raise WlmError(f"size: expected an even width and height for a film, got {width} x {height}")
     if name.endswith(".webp") and 3 * frames * height * width > _WEBP_BYTES:
-        most = _WEBP_BYTES // (3 * height * width)
-        raise WlmError(
-            f"frames: expected at most {most} of {width} x {height} pixels for an animated WebP, got {frames}; the "
-            "extra wlm[film] writes longer films"
-        )
+        most = f"{_WEBP_BYTES // (3 * height * width)} of {width} x {height} pixels for an animated WebP"
+        raise WlmError(f"frames: expected at most {most}, got {frames}; the extra wlm[film] writes longer films")
 
 
 def _views(renderer: Renderer, hours: Sequence[float], folder: Path, meter: Meter) -> list[dict[str, float]]:
