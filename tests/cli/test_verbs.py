@@ -156,6 +156,9 @@ def test_the_kind_of_an_input_chooses_the_system(tmp_path):
     (tmp_path / "empty").mkdir()
     Image.new("L", (8, 8)).save(tmp_path / "empty" / "mask.png")
     assert "--system NAME" in fails("compress", tmp_path / "empty", "-o", tmp_path / "a.wlm")
+    Image.new("RGB", (8, 8)).save(tmp_path / "empty" / "light_6h.png")
+    assert input_system(tmp_path / "empty") == "lightmap"
+    assert "; with --encoding .png" in fails("compress", tmp_path / "empty", "-o", tmp_path / "a.wlm")
 
 
 def commands(group, path=()):

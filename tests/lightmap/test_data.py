@@ -260,9 +260,8 @@ def test_malformed_set_names_the_field(tmp_path, changes, expected):
 
 def test_path_that_does_not_exist(tmp_path):
     assert "nowhere" in error_of(load, tmp_path / "nowhere")
-    assert "expected a set.json or lightmaps (.exr, .hdr, .ktx2, .dds, .pfm, .tif, .tiff), found none" in error_of(
-        load, tmp_path
-    )
+    expected = "expected a set.json or lightmaps (.exr, .hdr, .ktx2, .dds, .pfm, .tif, .tiff; with --encoding .png, "
+    assert expected in error_of(load, tmp_path)
 
 
 def test_plain_folder_takes_files_in_natural_order(tmp_path):

@@ -13,6 +13,7 @@ from wlm.formats.folder import read_index
 from wlm.formats.gltf import read_gltf
 from wlm.formats.godot import read_users
 from wlm.formats.hours import hours_of_names
+from wlm.formats.levels import SUFFIXES as LEVEL_SUFFIXES
 from wlm.formats.light import SUFFIXES
 from wlm.formats.meshes import SUFFIXES as MESHES
 from wlm.formats.reading import system_errors
@@ -108,7 +109,9 @@ def _folder_system(folder: Path) -> str:
         return "smoke" if stated == FRAMES else "export"
     pictures = _light(files)
     if not pictures:
-        return "smoke" if any(file.suffix.lower() in (".vdb", ".nvdb") for file in files) else ""
+        kinds = {file.suffix.lower() for file in files if file.name != "mask.png" and not is_half(file)}
+        # Pictures of integers are light once their encoding is stated.
+        return "smoke" if kinds & {".vdb", ".nvdb"} else "lightmap" * bool(kinds & {*LEVEL_SUFFIXES, ".tif", ".tiff"})
     sizes = {picture.size for picture in pictures.values() if picture.width}
     return "meshes" if len(sizes) > 1 else "lightmap"
 

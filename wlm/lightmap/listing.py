@@ -229,7 +229,8 @@ def _list_folder(folder: Path, times: Sequence[float] | None, levels: bool) -> L
     # Hidden files belong to other programs: macOS writes one beside every file on a foreign disk.
     files = sorted((f for f in files if f.name[0] != "."), key=lambda f: (natural(f.name), f.name))
     if not files:
-        raise WlmError(f"{folder}: expected a {SET_FILE} or lightmaps ({', '.join(SUFFIXES)}), found none of them")
+        known = f"{', '.join(SUFFIXES)}; with --encoding {', '.join(LEVEL_SUFFIXES)}"
+        raise WlmError(f"{folder}: expected a {SET_FILE} or lightmaps ({known}), found none of them")
     mask, timed = folder / "mask.png", _timed(folder, [f.stem for f in files], times, "lightmap")
     return _of_files(folder.resolve().name, folder, files, str(mask) if mask.is_file() else "all", **timed)
 
