@@ -40,6 +40,7 @@ from wlm.probe.data import load as load_probes
     [
         ({"hours": [3, 3.0000000001]}, "hours: expected different hours"),
         ({"hours": [24], "period": 24}, "below the period of 24"),
+        ({"lamps": [{"material": "a", "lit": [18, 30]}], "period": 24}, "lamps: lit: expected hours from 0 to"),
         ({"daylight": {}, "sky": {}}, "found both"),
         ({"lamps": [{"material": "a", "position": [0, 0, 0]}]}, "either a position or a material"),
         ({"lamps": [{"material": "a", "intensity": [1, 1, 1]}]}, "an intensity for a lamp with a position"),

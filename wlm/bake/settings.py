@@ -14,6 +14,7 @@ Lengths are in metres, as in the glTF file; +y is up. Light is linear RGB: dayli
 model (about 1.5 at a clear noon), times `scale`; other lights use the same unit or any other.
 """
 
+import math
 from typing import Annotated, Self
 
 from pydantic import Field, model_validator
@@ -89,16 +90,13 @@ class Lamp(Checked):
     def _one_kind(self) -> Self:
         if (self.position is None) == (self.material is None):
             raise ValueError("expected a lamp with either a position or a material")
-        given = self.model_fields_set
-        if ("radiance" in given and self.material is None) or ("intensity" in given and self.position is None):
+        if ("radiance" if self.material is None else "intensity") in self.model_fields_set:
             raise ValueError("expected an intensity for a lamp with a position, a radiance for a lamp with a material")
         return self
 
     def is_lit(self, hour: float) -> bool:
         """Returns whether the lamp is on at an hour."""
-        if self.lit is None:
-            return True
-        on, off = self.lit
+        on, off = self.lit or (-math.inf, math.inf)
         return on <= hour < off if on <= off else hour >= on or hour < off
 
 
@@ -165,6 +163,9 @@ class BakeScene(Checked):
             raise ValueError("hours: expected different hours, found two that are equal after rounding to nine digits")
         if self.period is not None and not all(0 <= hour < self.period for hour in self.hours):
             raise ValueError(f"hours: expected hours of at least 0 and below the period of {self.period:g}")
+        lit = [hour for lamp in self.lamps for hour in lamp.lit or ()]
+        if self.period is not None and not all(0 <= hour <= self.period for hour in lit):
+            raise ValueError(f"lamps: lit: expected hours from 0 to the period of {self.period:g}")
         return self
 
     @property

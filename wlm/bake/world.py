@@ -26,7 +26,9 @@ def make_hour(scene: BakeScene, geometry: Geometry, picture: np.ndarray | None, 
     """Builds Mitsuba's scene with the lights of one hour of `scene.hours`, except the sun and uniform ambient light,
     and settings that include these two; `picture` is the environment map, float32 [H, W, 3], or None."""
     content: dict[str, Any] = {"type": "scene"}
-    glowing = {lamp.material: lamp.radiance if lamp.is_lit(hour) else (0.0, 0.0, 0.0) for lamp in scene.lamps}
+    glowing: dict[str | None, Any] = {}
+    for lamp in scene.lamps:  # a material may have several, each with its hours
+        glowing[lamp.material] = lamp.is_lit(hour) * np.array(lamp.radiance) + glowing.get(lamp.material, 0.0)
     for i, surface in enumerate(geometry.surfaces):
         emission = glowing.get(surface.material.name, surface.material.emission)
         content[f"surface{i}"] = _mesh(surface, emission, f"surface{i}")
