@@ -61,8 +61,7 @@ def inspect(path: str | os.PathLike[str]) -> list[Finding]:
     if not path.is_dir():
         return [_inside(path) or inspect_file(path)]
     _entries(path)
-    found: list[Finding] = []
-    waiting = [(path, 0)]
+    found, waiting = list[Finding](), [(path, 0)]
     for _ in range(MOST):
         if not waiting or len(found) >= MOST:
             break
@@ -107,8 +106,7 @@ def _folder_system(folder: Path) -> str:
     documents = [file for file in files if file.suffix.lower() == ".json"][:_DOCUMENTS]
     if stated := next(filter(None, map(document_of, documents)), None):
         return "smoke" if stated == FRAMES else "export"
-    pictures = _light(files)
-    if not pictures:
+    if not (pictures := _light(files)):
         kinds = {file.suffix.lower() for file in files if file.name != "mask.png" and not is_half(file)}
         # Pictures of integers are light once their encoding is stated.
         return "smoke" if kinds & {".vdb", ".nvdb"} else "lightmap" * bool(kinds & {*LEVEL_SUFFIXES, ".tif", ".tiff"})
@@ -118,8 +116,7 @@ def _folder_system(folder: Path) -> str:
 
 def _folder(folder: Path, most: int) -> tuple[list[Finding], list[Path]]:
     """Describes a folder in at most `most` findings; also returns the subfolders that no finding covers."""
-    findings: list[Finding] = []
-    taken: set[Path] = set()
+    findings, taken = list[Finding](), set[Path]()
     try:
         entries = _entries(folder)
         files = [entry for entry in entries if entry.is_file()]
@@ -182,8 +179,7 @@ def _documents(folder: Path, files: Sequence[Path]) -> _Found:
             if any(document_of(each) == BAKED for each in documents):
                 listed = set(files)
             return [(finding, listed | {file})]
-        stated = document_of(file)
-        if stated is not None:
+        if (stated := document_of(file)) is not None:
             # All files of the folder belong to that output.
             its = set(files) | set(_entries(folder))
             return [(_simulated(folder) if stated == FRAMES else Finding(folder, stated), its)]
@@ -206,8 +202,7 @@ def _unity(folder: Path, files: Sequence[Path]) -> _Found:
     if not states or (folder / SET_FILE).is_file():
         return []
     held = {state: [entry for entry in _entries(state) if "_comp_" in entry.name.lower()] for state in states}
-    problems: list[str] = []
-    times, options = None, list[str]()
+    problems, times, options = list[str](), None, list[str]()
     if len(states) > 1 and None in hours_of_names([state.name for state in states])[0]:
         times, options = range(len(states)), ["--times", f"0:{len(states)}:1"]
         problems.append(f"the hours of {', '.join(state.name for state in states[:8])} are unknown: change --times")
