@@ -75,7 +75,7 @@ def _long(*values: object) -> object:
 
 
 @pytest.mark.parametrize(
-    ("unpacked", "interpolation"), [(False, "radiance"), _long(True, "radiance"), _long(False, "network")]
+    ("unpacked", "interpolation"), [(False, "radiance"), (True, "radiance"), _long(False, "network")]
 )
 def test_lightmaps_decode_as_in_python(model, tmp_path, show, unpacked, interpolation):
     sheet = model.sheets[LIGHT]

@@ -44,6 +44,7 @@ function unpackBlocks(bytes, width, height) {
 
 // Decodes a block of four words into `texels` at an offset; `ends` and `shares` are scratch.
 function unpackBlock(block, ends, shares, texels, place, width) {
+  if (block.every((word) => word === 0)) return;  // padding, of which a GPU makes zeros
   const mode = 31 - Math.clz32(block[0] & -block[0]);
   if (!(mode in MODES)) throw new Error('the page is damaged: a block is of no BC7 mode');
   const [subsets, wide, turns, selects, colour, alpha, own, shared, count, second] = MODES[mode];
