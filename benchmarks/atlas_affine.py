@@ -45,7 +45,7 @@ def affine_gain(
         together = (torch.cat([getattr(each, name) for each in pieces]) for name in ("index", "light", "weight"))
         tiles = Tiles(*together, profile.tile)
         owner = torch.repeat_interleave(torch.tensor([len(each.index) for each in pieces], device=device))
-        error.append(torch.cat([curves(tiles, sizes, Stages(device)), _copied(tiles, owner)]).cpu().numpy())
+        error.append(torch.cat([curves(tiles, sizes, Stages(device)), _copied(tiles, owner)[None]]).cpu().numpy())
         for sheet in scene.sheets:
             room += (
                 share * sheet.mask.size * SOURCE_BITS - np.prod(tile_counts(*sheet.mask.shape, profile.tile)) * LUT_BITS
