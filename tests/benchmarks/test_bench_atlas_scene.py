@@ -102,7 +102,7 @@ def test_a_set_is_read_and_what_is_wrong_is_said(tmp_path):
 def test_rows(scene, rows, tmp_path):
     check_outputs(rows, tmp_path, (Panel("bpp"),))
     assert keys(rows) == [("scene", "few"), ("parts", "bits of few"), ("copies", "gain and offset, bits of few")]
-    whole, parts = rows
+    whole, parts, _copies = rows
     assert whole.scene == "boxes, 2 objects, 2 states" and whole["lightmaps"] == 4
     # Four parts have few sizes.
     assert 0.85 <= parts["bpp"] / whole["bpp"] <= 1.2
