@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -139,11 +140,9 @@ def _pairs(option: str, texts: Sequence[str] | None, names: Sequence[str]) -> di
 
 
 def _float(option: str, text: str) -> float:
-    try:
+    with suppress(ValueError):
         if math.isfinite(value := float(text)):
             return value
-    except ValueError:
-        pass
     raise WlmError(f"{option}: expected a finite number, got {text!r}")
 
 
