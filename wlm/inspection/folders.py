@@ -108,8 +108,10 @@ def _folder_system(folder: Path) -> str:
         return "smoke" if stated == FRAMES else "export"
     if not (pictures := _light(files)):
         kinds = {file.suffix.lower() for file in files if file.name != "mask.png" and not is_half(file)}
+        if kinds & {".vdb", ".nvdb"}:
+            return "smoke"
         # Pictures of integers are light once their encoding is stated.
-        return "smoke" if kinds & {".vdb", ".nvdb"} else "lightmap" * bool(kinds & {*LEVEL_SUFFIXES, ".tif", ".tiff"})
+        return "lightmap" if kinds & {*LEVEL_SUFFIXES, ".tif", ".tiff"} else ""
     sizes = {picture.size for picture in pictures.values() if picture.width}
     return "meshes" if len(sizes) > 1 else "lightmap"
 
